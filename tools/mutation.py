@@ -26,10 +26,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = "segslam"
 TESTS: dict[str, tuple[str, ...]] = {
-    "odometry": ("odometry",),
-    "registration": ("registration", "verification"),
-    "verification": ("verification", "test_rejections.py"),
-    "graph": ("graph", "core/test_robust.py", "slam/test_slam.py"),
+    "odometry": ("tests/odometry",),
+    "registration": ("tests/registration", "tests/verification"),
+    "verification": ("tests/verification", "tests/test_rejections.py"),
+    "graph": ("tests/graph", "tests/core/test_robust.py", "tests/slam/test_slam.py"),
 }
 """Room of the package -> its tests. What takes least time comes first."""
 SWAPPED_NAMES = {"min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum"}
@@ -85,8 +85,8 @@ class Outcome:
 def faults_of(source: str, file: str = "") -> list[Fault]:
     """All faults of the code within functions, in the order of their lines."""
     finder = _Finder(source, file)
-    finder.visit(ast.parse(source))
-    return sorted(set(finder.found), key=lambda fault: (fault.line, fault.column, fault.new))
+    found = {fault for node in _code(ast.parse(source)) for fault in finder.faults(node)}
+    return sorted(found, key=lambda fault: (fault.line, fault.column, fault.new))
 
 
 def chosen(faults: Sequence[Fault], *, num_lines: int, seed: int) -> list[Fault]:
@@ -102,11 +102,6 @@ def chosen(faults: Sequence[Fault], *, num_lines: int, seed: int) -> list[Fault]
 def files_of(room: str) -> list[Path]:
     """The modules of a room of the package."""
     return sorted((ROOT / SOURCE / room).rglob("*.py"))
-
-
-def tests_of(room: str) -> list[str]:
-    """The folders and files of tests of a room, relative to the root."""
-    return [f"tests/{test}" for test in TESTS[room]]
 
 
 class Copy:
@@ -137,15 +132,9 @@ class Copy:
             finally:
                 file.write_text(source, encoding="utf-8")
                 os.utime(file, ns=(about.st_atime_ns, about.st_mtime_ns))
-        row = fault.line - 1
-        return Outcome(
-            fault,
-            source.splitlines()[row].strip(),
-            broken.splitlines()[row].strip(),
-            status != 0,
-            "time limit" if status is None else _first_failure(text) if status else "",
-            round(time.monotonic() - start, 1),
-        )
+        before, after = (text.splitlines()[fault.line - 1].strip() for text in (source, broken))
+        by = "time limit" if status is None else _first_failure(text) if status else ""
+        return Outcome(fault, before, after, status != 0, by, round(time.monotonic() - start, 1))
 
     def _run(self, words: Sequence[str], environment: dict[str, str], limit_s: float) -> tuple[int | None, str]:
         """Exit status, None at the time limit, and what was printed."""
@@ -175,35 +164,31 @@ def _first_failure(text: str) -> str:
     return (named or lines or ["no output"])[-1].split(" - ")[0][:150]
 
 
-class _Finder(ast.NodeVisitor):
-    """Collects the faults of a source."""
+def _code(node: ast.AST, *, runs: bool = False) -> Iterator[ast.AST]:
+    """The nodes of the bodies of functions, without types and what has no effect while running."""
+    children = ast.iter_child_nodes(node)
+    if isinstance(node, UNTOUCHED):
+        return
+    if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+        children, runs = iter(node.body), True
+    elif isinstance(node, ast.AnnAssign):
+        children = iter([node.value] if node.value else [])
+    elif runs:
+        yield node
+    for child in children:
+        yield from _code(child, runs=runs)
+
+
+class _Finder:
+    """Finds the faults of the nodes of a source."""
 
     def __init__(self, source: str, file: str) -> None:
-        self.found: list[Fault] = []
         self._file = file
         self._lines = source.splitlines()
-        self._depth = 0
         tokens = tokenize.generate_tokens(io.StringIO(source).readline)
         self._tokens = [token for token in tokens if token.type in (tokenize.OP, tokenize.NAME)]
 
-    def visit(self, node: ast.AST) -> None:
-        if isinstance(node, UNTOUCHED):
-            return
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            self._depth += 1
-            for statement in node.body:
-                self.visit(statement)
-            self._depth -= 1
-            return
-        if isinstance(node, ast.AnnAssign):
-            if node.value is not None:
-                self.visit(node.value)
-            return
-        if self._depth:
-            self.found += self._faults(node)
-        self.generic_visit(node)
-
-    def _faults(self, node: ast.AST) -> Iterator[Fault]:
+    def faults(self, node: ast.AST) -> Iterator[Fault]:
         match node:
             case ast.BinOp():
                 yield from self._swapped(node.left, node.op, node.right)
@@ -223,12 +208,9 @@ class _Finder(ast.NodeVisitor):
                 old = self._lines[node.lineno - 1][column : self._column(node.lineno, node.end_col_offset or 0)]
                 half = value // 2 if isinstance(value, int) else value / 2
                 yield self._fault(node.lineno, column, old, repr(half))
-            case ast.Call(func=ast.Name(id=name) as function) if name in SWAPPED_NAMES:
-                column = self._column(function.lineno, function.col_offset)
-                yield self._fault(function.lineno, column, name, SWAPPED_NAMES[name])
-            case ast.Call(func=ast.Attribute(attr=name, end_lineno=int(line), end_col_offset=int(end))):
-                if name in SWAPPED_NAMES:
-                    yield self._fault(line, self._column(line, end) - len(name), name, SWAPPED_NAMES[name])
+            case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name) as function) if name in SWAPPED_NAMES:
+                line, end = function.end_lineno or 0, function.end_col_offset or 0
+                yield self._fault(line, self._column(line, end) - len(name), name, SWAPPED_NAMES[name])
             case _:
                 pass
 
@@ -254,7 +236,14 @@ class _Finder(ast.NodeVisitor):
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    options = _options(arguments)
+    parser = argparse.ArgumentParser(prog="python -m tools.mutation", description=str(__doc__).partition("\n")[0])
+    parser.add_argument("--lines", type=int, default=60, help="number of lines to break, one at a time")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--skip", type=int, default=0, help="leave out the first faults, as after an interruption")
+    parser.add_argument("--rooms", nargs="+", choices=TESTS, default=list(TESTS), help="whose lines are broken")
+    parser.add_argument("--limit-s", type=float, default=300.0, help="time limit of the tests of one fault")
+    parser.add_argument("--out", type=Path, help="JSON file of all outcomes")
+    options = parser.parse_args(arguments)
     faults, room_of = [], {}
     for name in options.rooms:
         for path in files_of(name):
@@ -267,40 +256,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
         copy = Copy(Path(folder))
         for fault in picked:
-            one = copy.outcome(fault, tests_of(room_of[fault.file]), limit_s=options.limit_s)
+            one = copy.outcome(fault, TESTS[room_of[fault.file]], limit_s=options.limit_s)
             outcomes.append(one)
-            print(_row(one), flush=True)
+            state = f"noticed by {one.by}" if one.is_noticed else "SURVIVED"
+            change = f"{fault.file}:{fault.line}: {one.before}  ->  {one.after}"
+            print(f"{change}  {state}  ({one.seconds:.0f} s)", flush=True)
             if options.out:
                 options.out.parent.mkdir(parents=True, exist_ok=True)
                 options.out.write_text(json.dumps([asdict(outcome) for outcome in outcomes], indent=1) + "\n")
-    print(_table(outcomes, room_of))
-
-
-def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m tools.mutation", description=str(__doc__).partition("\n")[0])
-    parser.add_argument("--lines", type=int, default=60, help="number of lines to break, one at a time")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--skip", type=int, default=0, help="leave out the first faults, as after an interruption")
-    parser.add_argument("--rooms", nargs="+", choices=TESTS, default=list(TESTS), help="whose lines are broken")
-    parser.add_argument("--limit-s", type=float, default=300.0, help="time limit of the tests of one fault")
-    parser.add_argument("--out", type=Path, help="JSON file of all outcomes")
-    return parser.parse_args(arguments)
-
-
-def _row(one: Outcome) -> str:
-    state = f"noticed by {one.by}" if one.is_noticed else "SURVIVED"
-    return f"{one.fault.file}:{one.fault.line}: {one.before}  ->  {one.after}  {state}  ({one.seconds:.0f} s)"
-
-
-def _table(outcomes: Sequence[Outcome], room_of: dict[str, str]) -> str:
-    lines = [f"{'room':<14}{'noticed':>8}{'survived':>9}"]
-    for name in dict.fromkeys(room_of.values()):
-        own = [one.is_noticed for one in outcomes if room_of[one.fault.file] == name]
-        if own:
-            lines.append(f"{name:<14}{sum(own):>8}{len(own) - sum(own):>9}")
-    noticed = sum(one.is_noticed for one in outcomes)
-    lines.append(f"{'all':<14}{noticed:>8}{len(outcomes) - noticed:>9}")
-    return "\n".join(lines)
+    print(f"{'room':<14}{'noticed':>8}{'survived':>9}")
+    for name in (*options.rooms, "all"):
+        own = [one.is_noticed for one in outcomes if name in ("all", room_of[one.fault.file])]
+        if own or name == "all":
+            print(f"{name:<14}{sum(own):>8}{len(own) - sum(own):>9}")
 
 
 if __name__ == "__main__":

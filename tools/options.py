@@ -43,27 +43,23 @@ EXPERTS = """
 # All settings, for experts
 """
 SOURCE = re.compile(r" \[([^\]]+)\]$")
-SIGNS = {Ge: ("at least", "ge"), Gt: ("above", "gt"), Le: ("at most", "le"), Lt: ("below", "lt")}
+SIGNS: dict[type, tuple[str, str]] = {
+    **{Ge: ("at least", "ge"), Gt: ("above", "gt"), Le: ("at most", "le"), Lt: ("below", "lt")},
+    MinLen: ("length at least", "min_length"),
+}
 TRAILING_UNITS = re.compile(r" \((m|s|degrees|m\^2|m per m)\)$")
-
-
-def main() -> None:
-    """Write the page."""
-    PAGE.parent.mkdir(exist_ok=True)
-    PAGE.write_text(page(), encoding="utf-8")
 
 
 def page() -> str:
     """The page's text."""
     default = Config()
-    users = "".join(_user_row(default, *key.split(".")) for key in USER_SETTINGS)
+    users = ""
+    for setting in USER_SETTINGS:
+        name, key = setting.split(".")
+        section = getattr(default, name)
+        users += _row(setting, section.model_dump(mode="json")[key], type(section).model_fields[key])
     sections = "".join(_section(name, getattr(default, name)) for name in Config.model_fields)
     return INTRODUCTION + USERS + users + EXPERTS + sections
-
-
-def _user_row(config: Config, name: str, key: str) -> str:
-    section = getattr(config, name)
-    return _row(f"{name}.{key}", section.model_dump(mode="json")[key], type(section).model_fields[key])
 
 
 def _section(name: str, section: Section) -> str:
@@ -98,14 +94,8 @@ def _shown(value: Any) -> str:
 def _allowed(field: FieldInfo) -> str:
     if choices := _choices(field.annotation):
         return ", ".join(f"`{_shown(choice)}`" for choice in choices)
-    bounds = [f"{words} {getattr(limit, name):g}" for limit in field.metadata for words, name in _sign(limit)]
-    return ", ".join(bounds)
-
-
-def _sign(limit: object) -> list[tuple[str, str]]:
-    if isinstance(limit, MinLen):
-        return [("length at least", "min_length")]
-    return [SIGNS[type(limit)]] if type(limit) in SIGNS else []
+    signs = [(*SIGNS[type(limit)], limit) for limit in field.metadata if type(limit) in SIGNS]
+    return ", ".join(f"{words} {getattr(limit, name):g}" for words, name, limit in signs)
 
 
 def _choices(hint: Any) -> tuple[object, ...]:
@@ -117,4 +107,4 @@ def _choices(hint: Any) -> tuple[object, ...]:
 
 
 if __name__ == "__main__":
-    main()
+    PAGE.write_text(page(), encoding="utf-8")

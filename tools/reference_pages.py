@@ -78,8 +78,8 @@ def api_page() -> str:
             continue
         kind = "autoclass" if inspect.isclass(made) else "autofunction"
         target = f"{made.__module__}.{made.__qualname__}"
-        members = "\n:members:" if kind == "autoclass" else ""
-        reference = f"```{{eval-rst}}\n.. {kind}:: {target}{_indented(members)}\n```"
+        members = "\n   :members:" if kind == "autoclass" else ""
+        reference = f"```{{eval-rst}}\n.. {kind}:: {target}{members}\n```"
         parts.append(f"## {name}\n\n{reference}\n\n{examples[name]}\n")
     parts.append("## Records\n\nStages exchange these frozen records.\n")
     parts.append(f"```{{eval-rst}}\n.. automodule:: {RECORDS}\n   :members:\n   :noindex:\n```\n")
@@ -93,21 +93,13 @@ def api_examples() -> dict[str, str]:
     return {name: f"```python\n{code.strip()}\n```" for name, _, code in named}
 
 
-def _indented(text: str) -> str:
-    return text.replace("\n", "\n   ")
-
-
 def _row(parameter: Any) -> str:
     names = ", ".join(f"`{name}`" for name in (*parameter.opts, *parameter.secondary_opts))
     name = f"`{parameter.name.upper()}`" if parameter.param_type_name == "argument" else names
     default = parameter.default
-    shown = (
-        "required"
-        if parameter.required
-        else ""
-        if callable(default) or default in (None, False, ())
-        else f"`{default}`"
-    )
+    shown = "" if callable(default) or default in (None, False, ()) else f"`{default}`"
+    if parameter.required:
+        shown = "required"
     meaning = (getattr(parameter, "help", "") or "").replace("|", "\\|").replace("<", "&lt;")
     return f"| {name} | {shown} | {meaning} |"
 

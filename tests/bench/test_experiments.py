@@ -9,7 +9,7 @@ import pytest
 
 from segslam.bench.experiments import paper, provenance
 from segslam.bench.experiments.benchmark import run
-from segslam.bench.experiments.job import Job
+from segslam.bench.experiments.job import Job, failed_row
 from segslam.bench.experiments.method_settings import METHOD_NAMES
 from segslam.bench.experiments.pairs import (
     PAPER_PAIR,
@@ -142,6 +142,12 @@ def test_labels_are_removed_in_the_given_share_independently_at_each_draw() -> N
     assert {t.target.lost for t in both} == {0.1, 0.9}
     assert {t.target for t in one} == {ScanVariant(10)}
     assert {t.source.draw for t in one} == {3, 4, 5}
+
+
+def test_without_lost_labels_there_is_one_draw_whose_row_is_that_of_the_trial() -> None:
+    trials = pair_trials(PAPER_PAIR, drive(), lost_percent=[0.0, 50.0], num_draws=2, seed=3, both=True)
+    assert [(trial.source.lost, trial.source.draw) for trial in trials] == [(0.0, 0), (0.5, 6), (0.5, 7)]
+    assert [failed_row("gicp", trial, "").key[:3] for trial in trials] == [trial.key for trial in trials]
 
 
 def test_rows_come_back_from_their_file_but_for_a_line_that_was_cut_off(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from segslam.bench.simulation.files import prepare_folder, uncorrected, write_drive, write_sequence
+from segslam.bench.simulation.files import prepare_folder, uncorrected, write_drive
 from segslam.bench.simulation.sensor import drive_sweeps
 from segslam.bench.simulation.tracks import NOMINAL_CALIB, Drive, example_drive, in_lane, read_drive
 from segslam.bench.simulation.world import build_world
@@ -33,10 +33,10 @@ def sweeps(drive):
 
 
 @pytest.fixture(scope="module")
-def written(drive, sweeps, tmp_path_factory):
+def written(drive, tmp_path_factory):
     out = tmp_path_factory.mktemp("kitti")
     prepare_folder(out, "03", overwrite=False)
-    assert list(write_sequence(out, "03", drive, sweeps)) == [1, 2, 3, 4]
+    assert list(write_drive(out, "03", drive, config=CONFIG, seed=0)) == [1, 2, 3, 4]
     return out
 
 
@@ -81,14 +81,15 @@ def test_points_are_lowered_by_what_readers_add():
     np.testing.assert_allclose(np.arctan2(low[:, 1], low[:, 0]), np.arctan2(points[:, 1], points[:, 0]))
 
 
-def test_stopped_in_the_middle_it_is_a_shorter_sequence(drive, sweeps, tmp_path):
-    def stopped():
+def test_stopped_in_the_middle_it_is_a_shorter_sequence(drive, sweeps, tmp_path, monkeypatch):
+    def stopped(*_, **__):
         yield from sweeps[:2]
         raise KeyboardInterrupt
 
+    monkeypatch.setattr("segslam.bench.simulation.files.drive_sweeps", stopped)
     prepare_folder(tmp_path, "00", overwrite=False)
     with pytest.raises(KeyboardInterrupt):
-        list(write_sequence(tmp_path, "00", drive, stopped()))
+        list(write_drive(tmp_path, "00", drive, config=CONFIG, seed=0))
     dataset = open_dataset(tmp_path, sequence="00")
     assert [scan.index for scan in dataset] == [0, 1]
     assert len(dataset.reference) == 2
@@ -107,10 +108,9 @@ def test_fewer_scans_are_the_same_scans(tmp_path):
     assert SimulationConfig.model_validate(kept["config"]) == CONFIG
 
 
-def test_a_sequence_that_is_there_is_replaced_only_on_demand(drive, sweeps, tmp_path):
+def test_a_sequence_that_is_there_is_replaced_only_on_demand(drive, tmp_path):
     prepare_folder(tmp_path, "00", overwrite=False)
-    (tmp_path / "sequences/00/simulation.json").write_text("{}")
-    list(write_sequence(tmp_path, "00", drive, sweeps))
+    list(write_drive(tmp_path, "00", drive, config=CONFIG, seed=0))
     with pytest.raises(SegslamError, match="--overwrite"):
         prepare_folder(tmp_path, "00", overwrite=False)
     prepare_folder(tmp_path, "00", overwrite=True)
@@ -127,7 +127,7 @@ def test_real_data_is_never_replaced(tmp_path):
     assert scan.read_bytes() == b"real"
 
 
-@pytest.mark.parametrize("name", ["../00", "a/b", ""])
+@pytest.mark.parametrize("name", ["../00", "a/b", "", ".."])
 def test_a_sequence_needs_a_plain_name(tmp_path, name):
     with pytest.raises(SegslamError, match="plain name"):
         prepare_folder(tmp_path, name, overwrite=False)

@@ -233,7 +233,7 @@ def test_a_rival_that_does_not_converge_where_it_is_rivals_but_is_not_returned(
 def test_a_pose_that_slides_along_a_wall_rivals_another_on_the_wall(data_dir) -> None:
     """Two scans of a courtyard, cut to a view of 40 degrees, see one wall; a pose 6.6 m along it fits as well."""
     drive = open_dataset(data_dir / "courtyard")
-    cut = [ALTERATIONS["view-40"][1](drive[row].points.astype(np.float64), row).astype(np.float32) for row in (85, 82)]
+    cut = [ALTERATIONS["view-40"].points(drive[row].points.astype(float), row).astype(np.float32) for row in (85, 82)]
     outcome = register(*cut)
     assert isinstance(outcome, Rejected), outcome
     assert outcome.reason == RejectReason.AMBIGUOUS

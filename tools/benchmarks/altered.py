@@ -17,10 +17,11 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core import geometry
 from segslam.core.trajectory import Poses, read_poses
-from segslam.core.types import Alignment, Points, Rotation, Vector
+from segslam.core.types import Points, Vector
 from segslam.output.finished import read_run
 from segslam.scans import open_dataset
 from segslam.verification import register
@@ -28,19 +29,13 @@ from tools.benchmarks import common
 from tools.benchmarks.real import within_covariance
 
 Rows = list[int]
-FIGURES = ("odometry_ate_m", "ate_m", "num_motions_repaired", "num_motions_broken", "num_loops_accepted")
-LOOPS = ("num_loops_false", "loop_recall")
+FIGURES = (
+    *("odometry_ate_m", "ate_m", "num_motions_repaired", "num_motions_broken"),
+    *("num_loops_accepted", "num_loops_false", "loop_recall"),
+)
 
 
-def _turned(roll_deg: float, pitch_deg: float) -> Rotation:
-    roll, pitch = np.radians(roll_deg), np.radians(pitch_deg)
-    return (
-        geometry.exp(np.array([roll, 0.0, 0.0, 0.0, 0.0, 0.0]))[:3, :3]
-        @ (geometry.exp(np.array([0.0, pitch, 0.0, 0.0, 0.0, 0.0]))[:3, :3])
-    )
-
-
-def _view(degrees: float) -> Callable[[Points, int], Points]:
+def _view(degrees: int) -> Callable[[Points, int], Points]:
     half = np.radians(degrees / 2)
     return lambda points, _: points[np.abs(np.arctan2(points[:, 1], points[:, 0])) <= half]
 
@@ -55,59 +50,42 @@ def _beams(apart_deg: float) -> Callable[[Points, int], Points]:
     return kept
 
 
-def _within(range_m: float) -> Callable[[Points, int], Points]:
-    return lambda points, _: points[np.linalg.norm(points, axis=1) < range_m]
-
-
 def _noise(points: Points, row: int) -> Points:
     near = points[np.linalg.norm(points, axis=1) < 30.0]
     return near + np.random.default_rng(row).normal(scale=0.03, size=near.shape)
 
 
-def _missing(first: float, count: int) -> Callable[[Rows], Rows]:
-    return lambda rows: rows[: int(first * len(rows))] + rows[int(first * len(rows)) + count :]
+class Alteration(NamedTuple):
+    """Which rows, in order; what becomes of their points; and the axes of the altered sensor."""
+
+    rows: Callable[[Rows], Rows] = lambda rows: rows
+    points: Callable[[Points, int], Points] = lambda points, _: points
+    axes: np.ndarray = np.eye(3)
+
+    def true_poses(self, T_world_lidar: Poses) -> Poses:
+        """Poses of the sensor as it was altered; a mirrored sensor is in a mirrored world."""
+        axes = np.eye(4)
+        axes[:3, :3] = self.axes
+        poses = T_world_lidar @ axes.T
+        return poses if np.linalg.det(self.axes) > 0 else axes @ poses
 
 
-def _same(rows: Rows) -> Rows:
-    return rows
-
-
-def _all(points: Points, _: int) -> Points:
-    return points
-
-
-ALTERATIONS: dict[str, tuple[Callable[[Rows], Rows], Callable[[Points, int], Points]]] = {
-    "none": (_same, _all),
-    "backwards": (lambda rows: rows[::-1], _all),
-    "every-third": (lambda rows: rows[::3], _all),
-    "every-second": (lambda rows: rows[::2], _all),
-    "removed-30-percent": (lambda rows: [row for row in rows if np.random.default_rng(row).random() > 0.3], _all),
-    "there-and-back": (lambda rows: rows[::2] + rows[1::2][::-1], _all),
-    "gap-30": (_missing(0.45, 30), _all),
-    "noise-3-cm-30-m": (_same, _noise),
-    "tilted": (_same, lambda points, _: points @ _turned(10.0, 30.0).T),
-    "upside-down": (_same, lambda points, _: points * [1.0, -1.0, -1.0]),
-    "mirrored": (_same, lambda points, _: points * [1.0, -1.0, 1.0]),
-    "beams-2-degrees": (_same, _beams(2.0)),
-    "within-20-m": (_same, _within(20.0)),
-    "view-180": (_same, _view(180.0)),
-    "view-90": (_same, _view(90.0)),
-    "view-70": (_same, _view(70.0)),
-    "view-40": (_same, _view(40.0)),
+ALTERATIONS = {
+    "none": Alteration(),
+    "backwards": Alteration(lambda rows: rows[::-1]),
+    "every-third": Alteration(lambda rows: rows[::3]),
+    "every-second": Alteration(lambda rows: rows[::2]),
+    "removed-30-percent": Alteration(lambda rows: [row for row in rows if np.random.default_rng(row).random() > 0.3]),
+    "there-and-back": Alteration(lambda rows: rows[::2] + rows[1::2][::-1]),
+    "gap-30": Alteration(lambda rows: rows[: int(0.45 * len(rows))] + rows[int(0.45 * len(rows)) + 30 :]),
+    "noise-3-cm-30-m": Alteration(points=_noise),
+    "tilted": Alteration(axes=ScipyRotation.from_euler("XY", [10.0, 30.0], degrees=True).as_matrix()),
+    "upside-down": Alteration(axes=np.diag([1.0, -1.0, -1.0])),
+    "mirrored": Alteration(axes=np.diag([1.0, -1.0, 1.0])),
+    "beams-2-degrees": Alteration(points=_beams(2.0)),
+    "within-20-m": Alteration(points=lambda points, _: points[np.linalg.norm(points, axis=1) < 20.0]),
+    **{f"view-{degrees}": Alteration(points=_view(degrees)) for degrees in (180, 90, 70, 40)},
 }
-"""Name -> which rows, in order; what becomes of their points."""
-
-
-def _true_poses(alteration: str, T_world_lidar: np.ndarray) -> np.ndarray:
-    """Poses of the sensor as it was altered."""
-    change = {"tilted": _turned(10.0, 30.0), "upside-down": np.diag([1.0, -1.0, -1.0])}.get(alteration)
-    poses = T_world_lidar.copy()
-    if change is not None:
-        poses[:, :3, :3] = poses[:, :3, :3] @ change.T
-    if alteration == "mirrored":
-        mirror = np.diag([1.0, -1.0, 1.0, 1.0])
-        poses = mirror @ poses @ mirror
-    return poses
 
 
 class Altered(NamedTuple):
@@ -121,19 +99,19 @@ class Altered(NamedTuple):
 def altered(scans: Path, poses: Path, frames: str | None, alteration: str, noise_m: float, seed: int) -> Altered:
     """The drive with the alteration, and normal noise of `noise_m` added to its points."""
     data = open_dataset(scans)
-    choose, alter = ALTERATIONS[alteration]
+    change = ALTERATIONS[alteration]
     first, last = (int(part) for part in frames.split(":")) if frames else (0, len(data))
-    rows = choose(list(range(first, min(last, len(data)))))
+    rows = change.rows(list(range(first, min(last, len(data)))))
     times = scans / "times.txt"
     stamps_s = np.sort(np.loadtxt(times)[rows]) if times.exists() else np.arange(len(rows)) / 10.0
     if alteration == "backwards" and times.exists():
         stamps_s = (np.loadtxt(times)[rows[0]] - np.loadtxt(times)[rows]).round(6)
 
     def points_of(number: int) -> Points:
-        points = alter(data[rows[number]].points.astype(np.float64), rows[number])
+        points = change.points(data[rows[number]].points.astype(np.float64), rows[number]) @ change.axes.T
         return (points + np.random.default_rng([seed, number]).normal(0.0, noise_m, points.shape)).astype(np.float32)
 
-    return Altered(points_of, stamps_s, _true_poses(alteration, read_poses(poses).T_a_b)[rows])
+    return Altered(points_of, stamps_s, change.true_poses(read_poses(poses).T_a_b)[rows])
 
 
 def mapped(drive: Altered) -> common.Row:
@@ -148,7 +126,7 @@ def mapped(drive: Altered) -> common.Row:
         np.savetxt(copy / "poses.txt", drive.T_world_lidar[:, :3].reshape(-1, 12), fmt="%.9g")
         common.segslam("map", copy, "--out", f"{folder}/run")
         run = read_run(Path(folder) / "run")
-        return {name: run.metrics.get(name) for name in (*FIGURES, *LOOPS)} | within_covariance(run)
+        return {name: run.metrics.get(name) for name in FIGURES} | within_covariance(run)
 
 
 def registered(drive: Altered, steps: Sequence[int]) -> common.Row:
@@ -158,12 +136,9 @@ def registered(drive: Altered, steps: Sequence[int]) -> common.Row:
         for target in (source - step for step in steps):
             found = register(drive.points_of(source), drive.points_of(target))
             T_true = geometry.inverse(drive.T_world_lidar[target]) @ drive.T_world_lidar[source]
-            outcome = "rejected"
-            if isinstance(found, Alignment):
-                is_right = common.is_right(geometry.inverse(T_true) @ found.fine.T_target_source)
-                outcome = "right" if is_right else "wrong"
-            counts[outcome] += 1
-    return {"pairs": counts.total(), **{name: counts[name] for name in ("right", "wrong", "rejected")}}
+            counts[common.verdict(found, T_true)] += 1
+    total, right, wrong = counts.total(), counts["right"], counts["wrong"]
+    return {"pairs": total, "right": right, "wrong": wrong, "rejected": total - right - wrong}
 
 
 def run_benchmark() -> None:

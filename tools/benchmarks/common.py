@@ -12,11 +12,12 @@ import numpy as np
 
 from segslam.bench.experiments.provenance import commit, machine
 from segslam.cli import main
+from segslam.core import geometry
 from segslam.core.evaluation import PoseError
-from segslam.core.types import Transform
+from segslam.core.types import Alignment, Rejected, Transform
 
-RIGHT_M, RIGHT_DEG = 0.5, 2.0
-"""Chosen: a refined pose with a larger error is in another minimum; correct ones have errors of centimetres."""
+RIGHT = 0.5, 2.0
+"""m, degrees. Chosen: a refined pose that errs more is in another minimum; correct ones have errors of centimetres."""
 
 Row = dict[str, Any]
 """A line of a table."""
@@ -47,9 +48,18 @@ def segslam(*words: object) -> None:
 
 
 def write_report(file: Path, figures: Mapping[str, Any]) -> None:
-    """JSON of the figures after the machine and the commit they were measured on."""
-    report = {"machine": machine(), "commit": commit()} | dict(figures)
-    file.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    """JSON of the figures, null where they are not finite, after the machine and the commit they were measured on."""
+    report = json.dumps({"machine": machine(), "commit": commit()} | dict(figures))
+    finite = json.loads(report, parse_constant=lambda _: None)
+    file.write_text(json.dumps(finite, indent=1) + "\n", encoding="utf-8")
+
+
+def spread(values: Sequence[float] | np.ndarray) -> dict[str, float]:
+    """Median, 95th percentile and maximum; empty without values."""
+    if not len(values):
+        return {}
+    median, p95, most = np.percentile(values, [50, 95, 100])
+    return {"median": float(median), "p95": float(p95), "max": float(most)}
 
 
 def markdown(title: str, rows: Sequence[Row]) -> str:
@@ -60,9 +70,16 @@ def markdown(title: str, rows: Sequence[Row]) -> str:
     return f"## {title}\n\n" + "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
-def is_right(T_error: Transform) -> bool:
-    """True if the error of a refined pose is that of a correct one."""
-    return PoseError.of(T_error).within(RIGHT_M, RIGHT_DEG)
+def is_right(T_target_source: Transform, T_true: Transform | None, tolerance: tuple[float, float] = RIGHT) -> bool:
+    """Whether the error of a refined pose is that of a correct one; False without a true pose: two other places."""
+    return T_true is not None and PoseError.of(geometry.inverse(T_true) @ T_target_source).within(*tolerance)
+
+
+def verdict(found: Alignment | Rejected, T_true: Transform | None, tolerance: tuple[float, float] = RIGHT) -> str:
+    """`right`, `wrong`, or the reason of the rejection."""
+    if isinstance(found, Rejected):
+        return found.reason.value
+    return "right" if is_right(found.fine.T_target_source, T_true, tolerance) else "wrong"
 
 
 def draw_pairs(allowed: np.ndarray, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:

@@ -28,7 +28,7 @@ from segslam.output.georeferenced import georeference, read_globe
 from tools.benchmarks.common import Row, markdown, parser, write_report
 
 SEED = 3401
-WRONG_SHARE, WRONG_M, RUN_S, JUMP_M, JUMP_S, CLOCK_S = 0.3, 30.0, 60.0, 50.0, 300.0, 0.5
+WRONG_SHARE, WRONG_M, JUMP_M, JUMP_S = 0.3, 30.0, 50.0, 300.0
 Alteration = Callable[[Fixes], Fixes]
 
 
@@ -53,10 +53,10 @@ def main() -> None:
 def _alterations(residuals: list[Path] | None) -> dict[str, Alteration]:
     made: dict[str, Alteration] = {
         "as they are": lambda fixes: fixes,
-        "30 % single ones wrong by 30 m": _single,
-        "30 % wrong by 30 m, in runs of 60 s": _in_runs,
+        "30 % single ones wrong by 30 m": _wrong,
+        "30 % wrong by 30 m, in runs of 60 s": partial(_wrong, run_s=60.0),
         "a jump of 50 m that stays for 5 minutes": _jump,
-        "clock 0.5 s off": lambda fixes: fixes.shifted(CLOCK_S),
+        "clock 0.5 s off": lambda fixes: fixes.shifted(0.5),
     }
     made |= {f"third {third + 1} removed": partial(_without_third, third=third) for third in range(3)}
     if residuals:
@@ -89,7 +89,8 @@ def _row(run: FinishedRun, fixes: Fixes, unaltered: Fixes, truth_origin: Origin 
     turn = align_positions(truth[:, :3, 3], poses[:, :3, 3]) @ geometry.inverse(T_enu_truth)
     found["heading (deg)"] = round(float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0]))), 3)
     if truth_origin is not None:
-        off = _enu(poses[:, :3, 3], globe.origin, truth_origin) - truth[:, :3, 3]
+        places = geodetic_from_enu(poses[:, :3, 3], globe.origin)
+        off = enu_from_geodetic(places, truth_origin) - truth[:, :3, 3]
         found["unaligned, horizontal (m)"] = round(float(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1)))), 3)
     return found
 
@@ -99,11 +100,6 @@ def _placed(positions: Points, stamp_ns: Indices, fixes: Fixes, origin: Origin) 
     within = fixes.usable & (fixes.stamp_ns >= stamp_ns[0]) & (fixes.stamp_ns <= stamp_ns[-1])
     there = np.column_stack([np.interp(fixes.stamp_ns[within], stamp_ns, column) for column in positions.T])
     return align_positions(there, enu_from_geodetic(fixes.places[within], origin))
-
-
-def _enu(positions: Points, origin: Origin, other: Origin) -> Points:
-    """Positions in the local frame of another origin."""
-    return enu_from_geodetic(geodetic_from_enu(positions, origin), other)
 
 
 def _moved(fixes: Fixes, shift_m: Points) -> Fixes:
@@ -117,22 +113,16 @@ def _moved(fixes: Fixes, shift_m: Points) -> Fixes:
     return replace(fixes, places=places)
 
 
-def _directions(rng: np.random.Generator, count: int) -> Points:
-    angle = rng.uniform(0.0, 2.0 * np.pi, count)
-    return WRONG_M * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)])
-
-
-def _single(fixes: Fixes) -> Fixes:
+def _wrong(fixes: Fixes, *, run_s: float = 0.0) -> Fixes:
+    """A share of the fixes, or of the runs of this duration, is wrong by WRONG_M."""
     rng = np.random.default_rng(SEED)
-    is_wrong = rng.random(len(fixes)) < WRONG_SHARE
-    return _moved(fixes, _directions(rng, len(fixes)) * is_wrong[:, None])
-
-
-def _in_runs(fixes: Fixes) -> Fixes:
-    rng = np.random.default_rng(SEED)
-    number = ((fixes.stamp_ns - fixes.stamp_ns[0]) // round(1e9 * RUN_S)).astype(int)
+    number = np.arange(len(fixes))
+    if run_s:
+        number = ((fixes.stamp_ns - fixes.stamp_ns[0]) // round(1e9 * run_s)).astype(int)
     is_wrong = rng.random(number.max() + 1) < WRONG_SHARE
-    return _moved(fixes, (_directions(rng, number.max() + 1) * is_wrong[:, None])[number])
+    angle = rng.uniform(0.0, 2.0 * np.pi, len(is_wrong))
+    directions = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
+    return _moved(fixes, (WRONG_M * directions * is_wrong[:, None])[number])
 
 
 def _jump(fixes: Fixes) -> Fixes:

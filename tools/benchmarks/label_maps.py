@@ -9,40 +9,32 @@ import json
 from pathlib import Path
 from typing import Any
 
+from segslam.output.finished import read_metrics
 from tools.benchmarks import common
 
 KEYS = (
-    "num_scans",
-    "num_keyframes",
-    "num_candidates",
-    "num_loops_accepted",
-    "num_loops_false",
-    "ate_m",
-    "odometry_ate_m",
+    *("num_scans", "num_keyframes", "num_candidates", "num_loops_accepted", "num_loops_false"),
+    *("ate_m", "odometry_ate_m"),
 )
 AXIS_WANDER_DEG = 0.25
 """Chosen: enough error of the sensor for so short a drive to drift visibly, as in the demo."""
-
-
-def simulated(folder: Path, sensor: str, *, num_frames: int | None, seed: int) -> None:
-    if not (folder / "poses" / "00.txt").exists():
-        wander = f"sensor.axis_wander_sigma_deg={AXIS_WANDER_DEG}"
-        frames = [] if num_frames is None else ["--frames", num_frames]
-        common.segslam("simulate", folder, "--sensor", sensor, "--seed", seed, "--set", wander, *frames, "--overwrite")
 
 
 def mapped(data: Path, out: Path, *options: object) -> dict[str, Any]:
     """The figures of a run, made if it is not there."""
     if not (out / "metrics.json").exists():
         common.segslam("map", data, "--sequence", "00", "--out", out, *options)
-    metrics = json.loads((out / "metrics.json").read_text())
+    metrics = read_metrics(out)
     return {key: metrics[key] for key in KEYS if key in metrics}
 
 
 def compared(work: Path, sensor: str, *, num_frames: int | None, seed: int) -> dict[str, Any]:
     """The map with true labels, the map with labels from shape, and the ratio of their errors."""
     data, true, shape = (work / f"{sensor}-{name}" for name in ("scans", "true", "shape"))
-    simulated(data, sensor, num_frames=num_frames, seed=seed)
+    if not (data / "poses" / "00.txt").exists():
+        wander = f"sensor.axis_wander_sigma_deg={AXIS_WANDER_DEG}"
+        frames = [] if num_frames is None else ["--frames", num_frames]
+        common.segslam("simulate", data, "--sensor", sensor, "--seed", seed, "--set", wander, *frames, "--overwrite")
     with_true = mapped(data, true, "--labels", "labels")
     with_shape = mapped(data, shape, "--labels", "geometric", "--odometry", true / "odometry_tum.txt")
     ratio = with_shape["ate_m"] / with_true["ate_m"]

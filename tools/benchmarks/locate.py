@@ -17,11 +17,10 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.evaluation import PoseError
-from segslam.core.trajectory import Poses
-from segslam.core.types import Rejected, Transform
+from segslam.core.types import Rejected
 from segslam.labels.label_files import computed
 from segslam.output.finished import read_run
-from segslam.run.locator import Located, Locator
+from segslam.run.locator import Locator
 from segslam.scans import open_dataset
 from tools.benchmarks import common
 
@@ -41,8 +40,10 @@ def main() -> None:
     data = open_dataset(options.data, sequence=options.sequence, labels=options.labels)
     if run.reference is None or data.reference is None:
         parser.error("the true poses of both drives are needed")
-    T_of_scan = dict(zip(run.reference.scan_index.tolist(), run.reference.T_world_lidar, strict=True))
-    T_of_query = dict(zip(data.reference.scan_index.tolist(), data.reference.T_world_lidar, strict=True))
+    T_of_scan, T_of_query = (
+        dict(zip(reference.scan_index.tolist(), reference.T_world_lidar, strict=True))
+        for reference in (run.reference, data.reference)
+    )
     scans = run.result.trajectory.scan_index[run.result.keyframe_rows]
     T_keyframes = np.stack([T_of_scan[int(scan)] for scan in scans])
     locator = Locator.from_run(options.run)
@@ -59,7 +60,12 @@ def main() -> None:
         found = locator.locate(geometry.apply(T_turned_lidar, scan.points), labels if labels.any() else None)
         seconds.append(perf_counter() - started)
         cpu_seconds.append(process_time() - started_cpu)
-        outcome = _outcome(found, T_true, T_keyframes)
+        if isinstance(found, Rejected):
+            outcome = f"rejected: {found.reason.value}"
+        else:
+            T_lidar_found = geometry.inverse(T_true) @ T_keyframes[found.keyframe_id]
+            error = PoseError.of(T_lidar_found @ found.alignment.fine.T_target_source)
+            outcome = "found" if error.success else "false"
         outcomes[("" if near else "off the map, ") + outcome] += 1
         by_scan[int(scan.index or 0)][outcome] += 1
     counted = sum(count for name, count in outcomes.items() if not name.startswith("off"))
@@ -74,14 +80,6 @@ def main() -> None:
         "cpu_seconds_median": float(np.median(cpu_seconds)),
     }
     print(json.dumps(figures, indent=2))
-
-
-def _outcome(found: Located | Rejected, T_true: Transform, T_keyframes: Poses) -> str:
-    if isinstance(found, Rejected):
-        return f"rejected: {found.reason.value}"
-    T_lidar_found = geometry.inverse(T_true) @ T_keyframes[found.keyframe_id]
-    error = PoseError.of(T_lidar_found @ found.alignment.fine.T_target_source)
-    return "found" if error.success else "false"
 
 
 if __name__ == "__main__":

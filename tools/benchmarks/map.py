@@ -20,6 +20,7 @@ from open3d.io import read_point_cloud
 from scipy.spatial import cKDTree
 
 from segslam import open_dataset
+from segslam.bench.labelling import STILL
 from segslam.core import geometry
 from segslam.core.config import load_config
 from segslam.core.types import Keyframe, Label, Transform
@@ -27,16 +28,6 @@ from segslam.labels.label_files import computed
 from segslam.output.log import read_log
 from segslam.output.map.write import write_map
 from tools.benchmarks import common
-
-STANDING = {
-    Label.MOVING_CAR: Label.CAR,
-    Label.MOVING_BICYCLIST: Label.BICYCLIST,
-    Label.MOVING_PERSON: Label.PERSON,
-    Label.MOVING_MOTORCYCLIST: Label.MOTORCYCLIST,
-    Label.MOVING_OTHER_VEHICLE: Label.OTHER_VEHICLE,
-    Label.MOVING_TRUCK: Label.TRUCK,
-}
-HIDDEN = np.array([STANDING.get(label, label) for label in Label], np.uint8)
 
 
 def main() -> None:
@@ -59,7 +50,7 @@ def main() -> None:
     def placed() -> Iterator[tuple[Keyframe, Transform]]:
         for step in log.steps():
             if step.keyframe is not None:
-                hidden = replace(step.keyframe, labels=HIDDEN[step.keyframe.labels])
+                hidden = replace(step.keyframe, labels=STILL[step.keyframe.labels])
                 yield hidden, T_world_keyframe[hidden.id]
 
     started = perf_counter()

@@ -5,9 +5,9 @@
 Times are those of one thread, as processor time, so that other work on the machine changes them little.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from time import process_time
-from typing import Protocol
 
 import numpy as np
 import small_gicp
@@ -27,12 +27,8 @@ GICP_VOXEL_M, THINNED_M, REACH_M = 1.0, 0.25, 2.0
 a wider reach for fast motions."""
 
 
-class Aligner(Protocol):
-    """Aligns sweep after sweep."""
-
-    def align(self, points: Points, T_last_predicted: Transform, /) -> Transform:
-        """T_odom_lidar of the next sweep, which probably moved so since the last."""
-        ...
+Align = Callable[[Points, Transform], Transform]
+"""Points of a sweep, and its probable motion since the last -> T_odom_lidar of the sweep."""
 
 
 class VoxelMap:
@@ -55,7 +51,7 @@ class VoxelMap:
         return self._T_odom_lidar
 
 
-def measured(name: str, aligner: Aligner, scans: Dataset, config: OdometryConfig) -> common.Row:
+def measured(name: str, align: Align, scans: Dataset, config: OdometryConfig) -> common.Row:
     """A row of the table. Raises SegslamError if the true poses are unknown."""
     if scans.reference is None:
         raise SegslamError(f"{scans.name}: has no true poses; give a data set with poses.txt")
@@ -64,7 +60,7 @@ def measured(name: str, aligner: Aligner, scans: Dataset, config: OdometryConfig
         T_last_lidar = geometry.inverse(poses[-2]) @ poses[-1] if len(poses) > 1 else np.eye(4)
         points, _, _ = deskew_scan(scans[row], T_last_lidar, config)
         started = process_time()
-        poses.append(aligner.align(points, T_last_lidar))
+        poses.append(align(points, T_last_lidar))
         times_ms.append(1000 * (process_time() - started))
     errors = trajectory_metrics(np.stack(poses[1:]), scans.reference.T_world_lidar)
     return {
@@ -86,12 +82,12 @@ def main() -> None:
     choose = {} if options.sequence is None else {"sequence": options.sequence}
     scans = open_dataset(options.data, frames=options.frames, labels="none", **choose)
     config = OdometryConfig(max_num_threads=1)
-    aligners: dict[str, Aligner] = {
-        f"KISS-ICP, {size} m": KissAligner(kiss_config(config.model_copy(update={"voxel_size_m": float(size)})))
+    aligners: dict[str, Align] = {
+        f"KISS-ICP, {size} m": KissAligner(kiss_config(config.model_copy(update={"voxel_size_m": float(size)}))).align
         for size in options.voxels.split(",")
     }
-    aligners["small_gicp VGICP"] = VoxelMap()
-    rows = [measured(name, aligner, scans, config) for name, aligner in aligners.items()]
+    aligners["small_gicp VGICP"] = VoxelMap().align
+    rows = [measured(name, align, scans, config) for name, align in aligners.items()]
     print(common.markdown(f"{options.data.name}, {len(scans)} scans", rows))
     if options.out:
         common.write_report(options.out, {"rows": rows})

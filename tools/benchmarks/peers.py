@@ -52,7 +52,8 @@ def kiss_slam(data: Path, sequence: str | None, program: Path, folder: Path, run
         started = time.perf_counter()
         environment = {**os.environ, "KISS_SLAM_OUT_DIR": str(folder), "MPLBACKEND": "Agg"}
         which = ["--dataloader", "kitti", "--sequence", sequence] if sequence else ["--dataloader", "generic"]
-        command = [str(program.absolute()), *which, str(_scans(data).absolute())]
+        scans = data / "velodyne" if (data / "velodyne").is_dir() else data
+        command = [str(program.absolute()), *which, str(scans.absolute())]
         done = subprocess.run(command, check=True, cwd=folder, env=environment, capture_output=True, text=True)
         printed.write_text(f"{done.stdout}\nseconds {time.perf_counter() - started:.1f}\n", encoding="utf-8")
     text = printed.read_text(encoding="utf-8")
@@ -66,10 +67,6 @@ def kiss_slam(data: Path, sequence: str | None, program: Path, folder: Path, run
         "num_loops_accepted": int(closures[1]) if closures else None,
         "seconds_total": float(text.rsplit("seconds", 1)[1]),
     }
-
-
-def _scans(data: Path) -> Path:
-    return data / "velodyne" if (data / "velodyne").is_dir() else data
 
 
 def main() -> None:

@@ -3,8 +3,8 @@
     python -m tools.benchmarks.real NAME=RUN[,RUN,...] ... --out docs/real_drives.json [--picture NAME=FILE.png]
 
 Runs of `segslam map` with default settings, several of one drive separated by commas: medians over them. KISS-ICP alone
-is computed again from the data of the first run. The covariances of its motions are compared with their errors: the
-share within the ellipsoid of 99 %, and the median of chi-square divided by the expected one.
+is that of the first run. The covariances of its motions are compared with their errors: the share within the ellipsoid
+of 99 %, and the median of chi-square divided by the expected one.
 """
 
 import json
@@ -17,14 +17,12 @@ import numpy as np
 from scipy.stats import chi2
 
 from segslam.core import geometry
-from segslam.core.evaluation import align_positions, trajectory_metrics
-from segslam.core.trajectory import Poses, rows_of_same_scan
-from segslam.core.types import Points
-from segslam.odometry.kiss import KissOdometry
+from segslam.core.evaluation import align_positions
+from segslam.core.trajectory import rows_of_same_scan
+from segslam.core.types import Points, Trajectory
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import LOG
 from segslam.output.log import read_log
-from segslam.scans import open_dataset
 from tools.benchmarks import common
 
 EXACT = ("num_loops_accepted", "num_loops_false", "num_motions_repaired", "num_motions_broken")
@@ -34,16 +32,7 @@ POINTS_EACH, REACH_M, LOW_M, HIGH_M = 150, 25.0, -1.0, 2.5
 """Of each keyframe in the picture: number of points, their range, and their height above the sensor."""
 
 
-def kiss_alone(run: FinishedRun) -> Poses | None:
-    """(n, 4, 4) poses of KISS-ICP with one thread and the settings of a run; None if its odometry was given."""
-    if run.options.get("odometry"):
-        return None
-    scans = open_dataset(run.options["data"], frames=run.options.get("frames") or None, labels="none")
-    odometry = KissOdometry(run.config.odometry.model_copy(update={"max_num_threads": 1}))
-    return np.stack([odometry.register(scans[row]).T_odom_lidar for row in range(len(scans))])
-
-
-def row(name: str, runs: list[FinishedRun], alone: Poses | None) -> common.Row:
+def row(name: str, runs: list[FinishedRun]) -> common.Row:
     """Medians over the runs of a drive; the range of errors beside them."""
     first, reference = runs[0], runs[0].reference
     if reference is None:
@@ -52,8 +41,8 @@ def row(name: str, runs: list[FinishedRun], alone: Poses | None) -> common.Row:
     rows = rows_of_same_scan(first.result.trajectory.scan_index, reference.scan_index)
     truth = reference.T_world_lidar[rows[:, 1]]
     found["length_m"] = round(float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()))
-    if alone is not None:
-        found["kiss_icp_ate_m"] = round(trajectory_metrics(alone[rows[:, 0]], truth)["ate_m"], 3)
+    if "kiss_icp_ate_m" in first.metrics:
+        found["kiss_icp_ate_m"] = round(first.metrics["kiss_icp_ate_m"], 3)
     for key in (*METRES, *EXACT, *OTHERS):
         values = [run.metrics[key] for run in runs if key in run.metrics]
         if values:
@@ -85,7 +74,7 @@ def within_covariance(run: FinishedRun) -> common.Row:
     }
 
 
-def draw(run: FinishedRun, alone: Poses, file: Path) -> None:
+def draw(run: FinishedRun, alone: Trajectory, file: Path) -> None:
     """The map by KISS-ICP alone and by the run, seen from above in one scale, with the true path."""
     from matplotlib.figure import Figure
 
@@ -96,7 +85,7 @@ def draw(run: FinishedRun, alone: Poses, file: Path) -> None:
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     steps = [step for step in read_log(run.folder / LOG).steps() if step.keyframe is not None]
     for axes, poses, title in (
-        (left, alone, "KISS-ICP alone"),
+        (left, alone.T_world_lidar, "KISS-ICP alone"),
         (right, run.result.trajectory.T_world_lidar, "segslam"),
     ):
         T_true_world = align_positions(poses[rows[:, 0], :3, 3], truth)
@@ -136,10 +125,9 @@ def main() -> None:
     for drive in options.drives:
         name, _, folders = drive.partition("=")
         runs = [read_run(folder) for folder in folders.split(",")]
-        alone = kiss_alone(runs[0])
-        rows.append(row(name, runs, alone))
+        rows.append(row(name, runs))
         print(json.dumps(rows[-1]), flush=True)
-        if name == pictured and alone is not None:
+        if name == pictured and (alone := runs[0].result.alone) is not None:
             draw(runs[0], alone, Path(picture))
     common.write_report(options.out, {"drives": rows})
 

@@ -17,14 +17,14 @@ from segslam.candidates import Places, signature_of, signatures_around
 from segslam.core import geometry
 from segslam.core.config import load_config
 from segslam.core.evaluation import PoseError
+from segslam.core.trajectory import travelled_m
 from segslam.core.types import Rejected
 from segslam.slam.recognition import MAX_PLACES, recognise
 from tools.benchmarks import common
 from tools.benchmarks.submaps import Submaps
 
-WRONG_M = 10.0
 NEAR_M = 10.0
-"""A query counts if there is an older place this near."""
+"""A query counts if there is an older place this near; a pose that is farther off is wrong."""
 
 
 def main() -> None:
@@ -37,7 +37,7 @@ def main() -> None:
     config = load_config()
     submaps = Submaps(options.data / "nclt", config)
     at = submaps.T_world_lidar[:, :3, 3]
-    travel_m = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))]
+    travel_m = travelled_m(submaps.T_world_lidar)
     first, end = map(int, options.queries.split(":"))
     index = Places()
     for row in range(end):
@@ -54,9 +54,8 @@ def main() -> None:
         started = process_time()
         own = signature_of(points, labels)
         shortlist = index.shortlist(own, below_id=num_old)
-        ranks.append(
-            next((k for k, one in enumerate(shortlist) if np.linalg.norm(at[one.place_id] - at[row]) < NEAR_M), None)
-        )
+        near = (k for k, one in enumerate(shortlist) if np.linalg.norm(at[one.place_id] - at[row]) < NEAR_M)
+        ranks.append(next(near, None))
         world = submaps.T_world_lidar.__getitem__
         found = recognise(query, shortlist, submaps.prepared, world, config=config, max_places=3)
         if isinstance(found, Rejected):
@@ -68,7 +67,7 @@ def main() -> None:
             outcome = f"rejected: {found.reason.value}"
         else:
             error = PoseError.of(geometry.inverse(submaps.T_world_lidar[row]) @ found.T_world_lidar)
-            outcome = "found" if error.success else ("wrong" if error.translation_m > WRONG_M else "off")
+            outcome = "found" if error.success else ("wrong" if error.translation_m > NEAR_M else "off")
         outcomes[("" if revisits else "no revisit, ") + outcome] += 1
     figures = {
         "queries": len(ranks),

@@ -13,7 +13,7 @@ import open3d as o3d
 
 from segslam.bench.simulation.mesh import Mesh, box, join_meshes, leaves, mesh, placed, stem
 from segslam.bench.simulation.objects import bush, car, tree
-from segslam.bench.simulation.world import Hits, cast_mesh, scene_of
+from segslam.bench.simulation.world import cast_mesh, rays_of, scene_of
 from segslam.core import geometry
 from segslam.core.types import Label, Points, Transform
 
@@ -37,14 +37,8 @@ class Scene:
     path: np.ndarray
     max_shift_m: float
     """Largest distance between two scans that still show the same objects."""
-    _rays: o3d.t.geometry.RaycastingScene
-
-    def cast(self, T_world_lidar: Transform, directions: Points, *, time_s: float = 0.0) -> Hits:
-        """The first hits of rays from the sensor's origin; `directions` (n, 3): unit vectors in the LiDAR frame."""
-        rays = np.empty((len(directions), 6), dtype=np.float32)
-        rays[:, :3] = T_world_lidar[:3, 3]
-        rays[:, 3:] = directions.astype(np.float32) @ T_world_lidar[:3, :3].T.astype(np.float32)
-        return cast_mesh(self._rays, self.mesh, rays)
+    rays: o3d.t.geometry.RaycastingScene
+    """That of `mesh`."""
 
 
 def _scene(parts: Sequence[Mesh], path: np.ndarray, max_shift_m: float) -> Scene:
@@ -52,12 +46,12 @@ def _scene(parts: Sequence[Mesh], path: np.ndarray, max_shift_m: float) -> Scene
     return Scene(whole, path, max_shift_m, scene_of(whole))
 
 
-def corridor(seed: int, *, regular: bool = False, length_m: float = 60.0) -> Scene:
+def corridor(seed: int, *, regular: bool = False) -> Scene:
     """A corridor 2.4 m wide and 2.6 m high with recessed doors.
 
     The doors are 3 m apart if `regular`. Otherwise their distances are irregular, and cupboards stand along the walls.
     """
-    rng = np.random.default_rng(seed)
+    rng, length_m = np.random.default_rng(seed), 60.0
     parts = [_slab(0.0, length_m, -1.2, 1.2, 0.0, Label.OTHER_GROUND), _slab(0.0, length_m, -1.2, 1.2, 2.6)]
     parts += [_wall([(x, -1.6), (x, 1.6)], 2.6) for x in (0.0, length_m)]
     for side in (-1.0, 1.0):
@@ -68,13 +62,8 @@ def corridor(seed: int, *, regular: bool = False, length_m: float = 60.0) -> Sce
             doors = [(x, rng.choice([0.9, 1.0, 1.4]), rng.uniform(0.12, 0.4)) for x in starts if x < length_m - 2.0]
         line = [(0.0, side * 1.2)]
         for x, width, depth in doors:
-            ends = (
-                (x, side * 1.2),
-                (x, side * (1.2 + depth)),
-                (x + width, side * (1.2 + depth)),
-                (x + width, side * 1.2),
-            )
-            line += ends
+            line += [(x, side * 1.2), (x, side * (1.2 + depth))]
+            line += [(x + width, side * (1.2 + depth)), (x + width, side * 1.2)]
         parts.append(_wall([*line, (length_m, side * 1.2)], 2.6))
         if not regular:
             parts += [
@@ -86,19 +75,18 @@ def corridor(seed: int, *, regular: bool = False, length_m: float = 60.0) -> Sce
     return _scene(parts, _path(along, 0.1 * np.sin(along), 1.0, 0.0), 6.0)
 
 
-def garage(seed: int, *, levels: int = 3) -> Scene:
-    """Levels 3 m apart with the same pillars and walls, but different cars. The path runs through all levels."""
+def garage(seed: int) -> Scene:
+    """Three levels 3 m apart with the same pillars and walls, but different cars. The path runs through all levels."""
     rng = np.random.default_rng(seed)
     length, width = 64.0, 34.0
     parts, paths = [_slab(0.0, length, 0.0, width, 0.0, Label.OTHER_GROUND)], []
-    for level in range(levels):
+    for level in range(3):
         floor = 3.0 * level
         parts.append(_slab(0.0, length, 0.0, width, floor + 2.85))
         rim = [(0.0, 0.0), (length, 0.0), (length, width), (0.0, width), (0.0, 0.0)]
         parts.append(_lifted(_wall(rim, 1.1), floor))  # a parapet, open above
-        parts.append(
-            _lifted(_wall([(28.0, 14.0), (36.0, 14.0), (36.0, 20.0), (28.0, 20.0), (28.0, 14.0)], 2.85), floor)
-        )
+        stairs = [(28.0, 14.0), (36.0, 14.0), (36.0, 20.0), (28.0, 20.0), (28.0, 14.0)]
+        parts.append(_lifted(_wall(stairs, 2.85), floor))
         pillars = [(x, y) for x in np.arange(8.0, length, 8.0) for y in (5.5, 11.5, 22.5, 28.5)]
         parts += [_lifted(box(0.5, 0.5, 0.0, 2.85, Label.BUILDING, at=at), floor) for at in pillars]
         for y in (2.7, 14.2, 19.8, 31.3):
@@ -112,9 +100,9 @@ def garage(seed: int, *, levels: int = 3) -> Scene:
     return _scene(parts, np.concatenate(paths), 10.0)
 
 
-def tunnel(seed: int, *, length_m: float = 240.0) -> Scene:
+def tunnel(seed: int) -> Scene:
     """A tunnel 10 m wide and 6 m high with niches, signs, lamps and cabinets at irregular distances."""
-    rng = np.random.default_rng(seed)
+    rng, length_m = np.random.default_rng(seed), 240.0
     parts = [_slab(0.0, length_m, -5.0, 5.0, 0.0, Label.ROAD), _slab(0.0, length_m, -5.0, 5.0, 6.0)]
     for side in (-1.0, 1.0):
         line = [(0.0, side * 5.0)]
@@ -205,7 +193,7 @@ def scan_points(
 ) -> Points:
     """One sweep (n, 3), float32, in the sensor's frame, with range noise and lost returns."""
     rays = _rays(sensor, rng)
-    ranges = scene.cast(T_world_lidar, rays).range_m
+    ranges = cast_mesh(scene.rays, scene.mesh, rays_of(T_world_lidar, rays)).range_m
     seen = (ranges > MIN_RANGE_M) & (ranges < MAX_RANGE_M) & (rng.random(len(rays)) > DROPOUT)
     ranges = ranges[seen] + rng.normal(scale=noise_m, size=int(seen.sum()))
     return (rays[seen] * ranges[:, None]).astype(np.float32)
@@ -234,16 +222,15 @@ def _slab(x0: float, x1: float, y0: float, y1: float, z: float, label: Label = L
     return mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), label)
 
 
-def _wall(line: Sequence[tuple[float, float]], height_m: float, label: Label = Label.BUILDING) -> Mesh:
+def _wall(line: Sequence[tuple[float, float]], height_m: float) -> Mesh:
     """A vertical wall along a line, from the ground up."""
     count = len(line)
     flat = np.column_stack([np.array(line), np.zeros(count)])
     here = np.arange(count - 1)
-    sides = [
-        np.column_stack([here, here + 1, here + 1 + count]),
-        np.column_stack([here, here + 1 + count, here + count]),
-    ]
-    return mesh(np.concatenate([flat, flat + np.array([0.0, 0.0, height_m])]), np.concatenate(sides), label)
+    sides = np.concatenate(
+        [np.column_stack([here, here + 1, here + 1 + count]), np.column_stack([here, here + 1 + count, here + count])]
+    )
+    return mesh(np.concatenate([flat, flat + np.array([0.0, 0.0, height_m])]), sides, Label.BUILDING)
 
 
 def _lifted(part: Mesh, z: float) -> Mesh:

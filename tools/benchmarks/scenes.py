@@ -12,21 +12,23 @@ Settings were chosen on even seeds and on seed 1; report others.
 import math
 import time
 from collections import Counter
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import Config, load_config
-from segslam.core.types import Alignment, LoopCandidate, Rejected, Transform
+from segslam.core.types import LoopCandidate, Points, Transform
 from segslam.graph.chains import prior_gate
 from segslam.keyframes import downsample_keyframe
 from segslam.labels import geometric_labels
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import register_prepared
 from segslam.verification.patches import agreement
-from segslam.verification.trial import Gate
+from segslam.verification.trial import Gate, anywhere
 from tools.benchmarks import common
 from tools.benchmarks.scene_models import SCENES, SENSORS, Scene, pose, scan_points
 
@@ -34,6 +36,29 @@ DRIFT_M, DRIFT_DEG, HEIGHT_M = 1.5, 3.0, 0.3
 """Standard deviations of the prior."""
 ELSEWHERE = 100
 """Added to the seed of a scene: another one of its kind."""
+
+
+class Task(NamedTuple):
+    """Two scans to register, and what is known about their pose."""
+
+    part: str
+    sensor: str
+    source: PreparedScan
+    target: PreparedScan
+    T_target_source: Transform | None
+    """None for scans of different worlds."""
+    is_true: bool
+    """True if the scans show the same place."""
+    gate: Gate = anywhere
+    tolerance: tuple[float, float] = common.RIGHT
+    """m, degrees within which a pose is right."""
+
+    @property
+    def overlap(self) -> float:
+        """At the true pose; 0 for scans of different places."""
+        if not self.is_true or self.T_target_source is None:
+            return 0.0
+        return agreement(self.source, self.target, self.T_target_source).overlap
 
 
 class Place:
@@ -50,52 +75,60 @@ class Place:
     def _prepare(self, row: int, visit: int) -> PreparedScan:
         rng = np.random.default_rng([self._seed, row, visit, 1])
         points = scan_points(self.scene, self._sensor, self.pose(row, visit), noise_m=self._noise_m, rng=rng)
-        labels = geometric_labels(points)
-        classes = tuple(self._config.segregator.cluster_min_points)
-        points, labels, _ = downsample_keyframe(points, labels, config=self._config.keyframes, whole_classes=classes)
-        return prepare_scan(points, labels, config=self._config)
+        return prepared_keyframe(points, self._config)
 
 
-def true_pairs(scene: Scene, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """Rows of the path within reach of each other and on one level."""
-    apart = np.linalg.norm(scene.path[:, None, :3] - scene.path[:, :3], axis=-1)
-    return common.draw_pairs((apart < scene.max_shift_m) & (_heights(scene) < 0.5), count, rng)
+def prepared_keyframe(points: Points, config: Config) -> PreparedScan:
+    """A scan labelled by shape, downsampled and prepared like the keyframe of a run."""
+    classes = tuple(config.segregator.cluster_min_points)
+    labels = geometric_labels(points)
+    points, labels, _ = downsample_keyframe(points, labels, config=config.keyframes, whole_classes=classes)
+    return prepare_scan(points, labels, config=config)
 
 
-def false_pairs(scene: Scene, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """Rows of the path at other levels, or as far apart as the scene allows."""
-    apart = np.linalg.norm(scene.path[:, None, :2] - scene.path[:, :2], axis=-1)
-    return common.draw_pairs((apart > 2.5 * scene.max_shift_m) | (_heights(scene) > 1.0), count, rng)
+def tasks(name: str, sensor: str, noise_m: float, *, count: int, seed: int, config: Config) -> Iterator[Task]:
+    """`count` true pairs of a scene, then as many false ones, half of them of the scene and another one of its kind."""
+    rng = np.random.default_rng([seed, 9])
+    here, elsewhere = (Place(SCENES[name](other), sensor, noise_m, other, config) for other in (seed, seed + ELSEWHERE))
+
+    def task(place: Place, source: int, target: int, *, is_true: bool) -> Task:
+        first, second = int(rng.integers(2)), int(rng.integers(2)) + 2
+        T_true = geometry.inverse(here.pose(target, second)) @ place.pose(source, first)
+        T_near = T_true if is_true else _beside(here.scene, source, target, rng, is_same=place is here)
+        gate = _gate(_drifted(T_near, rng), config)
+        scans = place.prepared(source, first), here.prepared(target, second)
+        return Task(name, sensor, *scans, T_true if place is here else None, is_true, gate)
+
+    for source, target in common.draw_pairs(_pairs(here.scene, are_true=True), count, rng):
+        yield task(here, source, target, is_true=True)
+    for number, (source, target) in enumerate(common.draw_pairs(_pairs(here.scene, are_true=False), count, rng)):
+        place = here if number % 2 else elsewhere
+        yield task(place, source % len(place.scene.path), target, is_true=False)
 
 
-def _heights(scene: Scene) -> np.ndarray:
-    return np.abs(scene.path[:, None, 2] - scene.path[:, 2])
+def _pairs(scene: Scene, *, are_true: bool) -> np.ndarray:
+    """Which rows of the path are within reach of each other on one level; or at other levels, or far apart."""
+    steps = scene.path[:, None, :3] - scene.path[:, :3]
+    climb = np.abs(steps[..., 2])
+    if are_true:
+        return (np.linalg.norm(steps, axis=-1) < scene.max_shift_m) & (climb < 0.5)
+    return (np.linalg.norm(steps[..., :2], axis=-1) > 2.5 * scene.max_shift_m) | (climb > 1.0)
 
 
-class Judge:
-    """Registers and verifies pairs like a run."""
-
-    def __init__(self, config: Config) -> None:
-        self._config = config
-
-    def __call__(self, source: PreparedScan, target: PreparedScan, T_prior: Transform) -> Alignment | Rejected:
-        return register_prepared(source, target, config=self._config, gate=near(T_prior, self._config))
-
-
-def near(T_prior: Transform, config: Config) -> Gate:
+def _gate(T_prior: Transform, config: Config) -> Gate:
     """The gate of a run whose odometry errs as much as it tolerates."""
     sigmas = np.array([*np.radians([DRIFT_DEG] * 3), DRIFT_M, DRIFT_M, HEIGHT_M]) / config.graph.error_allowance
     return prior_gate(LoopCandidate(1, 0, T_prior, geometry.distance(T_prior), np.diag(sigmas**2)), config)
 
 
-def prior(T_target_source: Transform, rng: np.random.Generator) -> Transform:
+def _drifted(T_target_source: Transform, rng: np.random.Generator) -> Transform:
     """A pose as odometry would give it after a loop."""
     drift = rng.normal(scale=[DRIFT_M, DRIFT_M, HEIGHT_M])
     turn = geometry.yaw(math.radians(rng.normal(scale=DRIFT_DEG)))
     return geometry.transform(np.eye(3), drift) @ T_target_source @ geometry.transform(turn, 0.0)
 
 
-def beside(scene: Scene, source: int, target: int, rng: np.random.Generator, *, is_same: bool) -> Transform:
+def _beside(scene: Scene, source: int, target: int, rng: np.random.Generator, *, is_same: bool) -> Transform:
     """A pose near the target's, as if the places of a false pair lay side by side; storeys of one scene keep theirs."""
     T_near = geometry.transform(geometry.yaw(rng.choice([0.0, np.pi])), [*rng.uniform(-4.0, 4.0, 2), 0.0])
     if is_same:
@@ -105,52 +138,24 @@ def beside(scene: Scene, source: int, target: int, rng: np.random.Generator, *, 
 
 def bench(name: str, sensor: str, noise_m: float, *, count: int, seed: int, config: Config) -> dict[str, object]:
     """A row of the table."""
-    rng = np.random.default_rng([seed, 9])
     started = time.perf_counter()
-    here, elsewhere = (Place(SCENES[name](other), sensor, noise_m, other, config) for other in (seed, seed + ELSEWHERE))
-    judge = Judge(config)
-    row: dict[str, object] = {"scene": name, "sensor": sensor, "noise_m": noise_m}
-    row |= _true(here, judge, count, rng, config) | _false(here, elsewhere, judge, count, rng)
-    return row | {"seconds": round(time.perf_counter() - started, 1)}
+    true, overlapping, false = Counter[str](), Counter[str](), Counter[str]()
+    for task in tasks(name, sensor, noise_m, count=count, seed=seed, config=config):
+        found = register_prepared(task.source, task.target, config=config, gate=task.gate)
+        verdict = common.verdict(found, task.T_target_source)
+        (true if task.is_true else false)[verdict] += 1
+        if task.overlap > 0.4:
+            overlapping[verdict] += 1
+    return {
+        **{"scene": name, "sensor": sensor, "noise_m": noise_m},
+        **{"overlapping": overlapping.total(), "kept": overlapping["right"], "lost": _reasons(overlapping)},
+        **{"accepted_wrong": true["wrong"], "false_accepted": false["wrong"], "rejected": _reasons(false)},
+        "seconds": round(time.perf_counter() - started, 1),
+    }
 
 
-def _true(place: Place, judge: Judge, count: int, rng: np.random.Generator, config: Config) -> dict[str, object]:
-    lost: Counter[str] = Counter()
-    kept = overlapping = wrong = 0
-    for source, target in true_pairs(place.scene, count, rng):
-        visits = int(rng.integers(2)), int(rng.integers(2)) + 2
-        T_source, T_target = place.pose(source, visits[0]), place.pose(target, visits[1])
-        one, other = place.prepared(source, visits[0]), place.prepared(target, visits[1])
-        T_true = geometry.inverse(T_target) @ T_source
-        counts = agreement(one, other, T_true).overlap > 0.4
-        found = judge(one, other, prior(T_true, rng))
-        right = isinstance(found, Alignment) and common.is_right(geometry.inverse(T_true) @ found.fine.T_target_source)
-        wrong += isinstance(found, Alignment) and not right
-        overlapping += counts
-        kept += counts and right
-        if counts and isinstance(found, Rejected):
-            lost[found.reason.value] += 1
-    return {"overlapping": overlapping, "kept": kept, "lost": dict(lost), "accepted_wrong": wrong}
-
-
-def _false(here: Place, elsewhere: Place, judge: Judge, count: int, rng: np.random.Generator) -> dict[str, object]:
-    """Half of the sources are of the same scene, half of another one of its kind."""
-    accepted = 0
-    rejected: Counter[str] = Counter()
-    for number, (source, target) in enumerate(false_pairs(here.scene, count, rng)):
-        place = here if number % 2 else elsewhere
-        source %= len(place.scene.path)
-        visits = int(rng.integers(2)), int(rng.integers(2)) + 2
-        T_source, T_target = place.pose(source, visits[0]), here.pose(target, visits[1])
-        T_near = beside(here.scene, source, target, rng, is_same=place is here)
-        found = judge(place.prepared(source, visits[0]), here.prepared(target, visits[1]), prior(T_near, rng))
-        if isinstance(found, Rejected):
-            rejected[found.reason.value] += 1
-        elif place is not here or not common.is_right(
-            geometry.inverse(T_source) @ T_target @ found.fine.T_target_source
-        ):
-            accepted += 1
-    return {"false_accepted": accepted, "rejected": dict(rejected)}
+def _reasons(verdicts: Counter[str]) -> dict[str, int]:
+    return {verdict: number for verdict, number in verdicts.items() if verdict not in ("right", "wrong")}
 
 
 def main() -> None:

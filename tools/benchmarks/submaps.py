@@ -14,7 +14,8 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import Config, load_config
-from segslam.core.types import Alignment, Points, Transform
+from segslam.core.trajectory import Poses, read_poses
+from segslam.core.types import Points
 from segslam.labels import geometric_labels
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.scans import open_dataset
@@ -34,25 +35,10 @@ class Submaps:
     def __init__(self, folder: Path, config: Config) -> None:
         self._scans = open_dataset(folder)
         self._config = config
-        self.T_world_lidar = poses_of(folder / "poses.txt")[: len(self._scans)]
-        self._T_odom_lidar = poses_of(folder / "lio.txt")
+        self.T_world_lidar = read_poses(folder / "poses.txt").T_a_b[: len(self._scans)]
+        self._T_odom_lidar = read_poses(folder / "lio.txt").T_a_b
         self.prepared = cache(self._prepare)
-        self._points = cache(self._read)
-
-    def pairs(self, count: int, rng: np.random.Generator, *, near: bool) -> list[tuple[int, int]]:
-        """Drawn among all that lie within NEAR_M of each other, or beyond FAR_M."""
-        at = self.T_world_lidar[:, :3, 3]
-        apart = np.linalg.norm(at[:, None] - at, axis=-1)
-        late = np.arange(len(at))[:, None] - np.arange(len(at)) > MIN_GAP
-        return common.draw_pairs(late & (apart < NEAR_M if near else apart > FAR_M), count, rng)
-
-    def error(self, source: int, target: int, T_target_source: Transform) -> Transform:
-        """The pose of the source by the registration in that by the optimised poses."""
-        T_true = geometry.inverse(self.T_world_lidar[target]) @ self.T_world_lidar[source]
-        return geometry.inverse(T_true) @ T_target_source
-
-    def _read(self, index: int) -> Points:
-        return self._scans[index].points
+        self._points = cache(lambda index: self._scans[index].points)
 
     def cloud(self, index: int) -> Points:
         """The scans around one, in its frame."""
@@ -67,12 +53,14 @@ class Submaps:
         return prepare_scan(points, labels, config=self._config, seen_from_here=self._points(index))
 
 
-def poses_of(file: Path) -> np.ndarray:
-    """(n, 4, 4) from rows of 3 x 4."""
-    rows = np.loadtxt(file).reshape(-1, 3, 4)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3] = rows
-    return poses
+def drive_pairs(
+    T_world_lidar: Poses, count: int, rng: np.random.Generator, *, near: bool, gap: int = MIN_GAP
+) -> list[tuple[int, int]]:
+    """Drawn among all scans more than `gap` apart that lie within NEAR_M of each other, or beyond FAR_M."""
+    at = T_world_lidar[:, :3, 3]
+    apart = np.linalg.norm(at[:, None] - at, axis=-1)
+    late = np.arange(len(at))[:, None] - np.arange(len(at)) > gap
+    return common.draw_pairs(late & (apart < NEAR_M if near else apart > FAR_M), count, rng)
 
 
 def run(submaps: Submaps, pairs: list[tuple[int, int]], config: Config) -> Counter[str]:
@@ -80,11 +68,8 @@ def run(submaps: Submaps, pairs: list[tuple[int, int]], config: Config) -> Count
     outcomes: Counter[str] = Counter()
     for source, target in pairs:
         found = register_prepared(submaps.prepared(source), submaps.prepared(target), config=config)
-        if isinstance(found, Alignment):
-            T_error = submaps.error(source, target, found.fine.T_target_source)
-            outcomes["right" if common.is_right(T_error) else "wrong"] += 1
-        else:
-            outcomes[found.reason.value] += 1
+        T_true = geometry.inverse(submaps.T_world_lidar[target]) @ submaps.T_world_lidar[source]
+        outcomes[common.verdict(found, T_true)] += 1
     return outcomes
 
 
@@ -100,7 +85,7 @@ def main() -> None:
     submaps = Submaps(options.data / "nclt", config)
     rng = np.random.default_rng(options.seed)
     for name, count, near in (("true", options.pairs, True), ("false", options.negatives, False)):
-        outcomes = run(submaps, submaps.pairs(count, rng, near=near), config)
+        outcomes = run(submaps, drive_pairs(submaps.T_world_lidar, count, rng, near=near), config)
         print(f"{name} pairs: {outcomes.total()}: {dict(outcomes)}", flush=True)
 
 

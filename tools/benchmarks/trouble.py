@@ -5,15 +5,18 @@ DRIVE is a folder that `segslam simulate` made. Every row is mapped with default
 """
 
 import json
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from functools import partial
+from itertools import compress
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import Config, load_config
-from segslam.core.evaluation import trajectory_metrics
+from segslam.core.trajectory import Poses, travelled_m
 from segslam.core.types import Scan, Trajectory
 from segslam.labels.label_files import of_rows
 from segslam.odometry.sweep import GivenOdometry
@@ -26,23 +29,28 @@ NEXT_BEAM_DEG = 180.0
 """A step back of the azimuth by more than this begins the next beam."""
 
 
-@dataclass(frozen=True)
-class Drive:
-    """Scans with true poses (n, 4, 4), and how the odometry is made where it is given."""
+class Drive(NamedTuple):
+    """Scans with true poses, and the odometry where it is given."""
 
-    scans: Callable[[], Iterator[Scan]]
-    T_world_lidar: np.ndarray
-    given: np.ndarray | None = None
+    scans: Callable[[], Iterable[Scan]]
+    T_world_lidar: Poses
+    given: Poses | None = None
+
+
+def changed(drive: Drive, change: Callable[[Scan], Scan], rows: range | None = None) -> Drive:
+    """Some scans are changed, by default all."""
+
+    def scans() -> Iterator[Scan]:
+        return (change(scan) if rows is None or row in rows else scan for row, scan in enumerate(drive.scans()))
+
+    return drive._replace(scans=scans)
 
 
 def without(drive: Drive, first: int, count: int) -> Drive:
     """Some scans are missing."""
-    rows = [row for row in range(len(drive.T_world_lidar)) if not first <= row < first + count]
-
-    def scans() -> Iterator[Scan]:
-        return (scan for row, scan in enumerate(drive.scans()) if row in set(rows))
-
-    return Drive(scans, drive.T_world_lidar[rows])
+    kept = np.ones(len(drive.T_world_lidar), bool)
+    kept[first : first + count] = False
+    return Drive(lambda: compress(drive.scans(), kept), drive.T_world_lidar[kept])
 
 
 def turned(drive: Drive, first: int, degrees: float) -> Drive:
@@ -50,27 +58,17 @@ def turned(drive: Drive, first: int, degrees: float) -> Drive:
     R = geometry.yaw(np.radians(degrees))
     poses = drive.T_world_lidar.copy()
     poses[first:] = poses[first:] @ geometry.transform(R, 0.0)
-
-    def scans() -> Iterator[Scan]:
-        for row, scan in enumerate(drive.scans()):
-            yield replace(scan, points=(scan.points @ R).astype(np.float32)) if row >= first else scan
-
-    return Drive(scans, poses)
+    rows = range(first, len(poses))
+    return changed(drive, lambda scan: replace(scan, points=(scan.points @ R).astype(np.float32)), rows)._replace(
+        T_world_lidar=poses
+    )
 
 
-def beside_a_truck(drive: Drive, first: int, metres: float) -> Drive:
-    """A wall of 14 m by 4 m drives along at the left and at the right, and hides what is behind it."""
-    last = _row_after(drive, first, metres)
+def beside_a_truck(scan: Scan) -> Scan:
+    """A wall of 14 m by 4 m at the left and at the right hides what is behind it.
 
-    def scans() -> Iterator[Scan]:
-        for row, scan in enumerate(drive.scans()):
-            yield _hidden(scan) if first <= row < last else scan
-
-    return Drive(scans, drive.T_world_lidar)
-
-
-def _hidden(scan: Scan) -> Scan:
-    """Rays that meet the planes y = 3 m or y = -3 m between x = -7 and 7 m, below 4 m, end there."""
+    Rays that meet the planes y = 3 m or y = -3 m between x = -7 and 7 m, below 4 m, end there.
+    """
     points = scan.points.astype(np.float64)
     share = 3.0 / np.maximum(np.abs(points[:, 1]), 1e-9)
     hit = points * np.minimum(share, 1.0)[:, None]
@@ -78,20 +76,11 @@ def _hidden(scan: Scan) -> Scan:
     return replace(scan, points=np.where(meets[:, None], hit, points).astype(np.float32))
 
 
-def in_tunnel(drive: Drive, first: int, metres: float) -> Drive:
-    """A smooth tube of 5 m radius around the sensor, without features along it."""
-    last = _row_after(drive, first, metres)
-    rng = np.random.default_rng(0)
+def in_tunnel(scan: Scan, rng: np.random.Generator) -> Scan:
+    """A smooth tube of 5 m radius around the sensor, without features along it.
 
-    def scans() -> Iterator[Scan]:
-        for row, scan in enumerate(drive.scans()):
-            yield _in_tube(scan, rng) if first <= row < last else scan
-
-    return Drive(scans, drive.T_world_lidar)
-
-
-def _in_tube(scan: Scan, rng: np.random.Generator) -> Scan:
-    """The rays of a scan end at the tube or at its floor, 1.7 m below the sensor; those beyond 60 m have no return."""
+    The rays end at the tube or at its floor, 1.7 m below the sensor; those beyond 60 m have no return.
+    """
     points = scan.points.astype(np.float64)
     rays = points / np.linalg.norm(points, axis=1, keepdims=True)
     to_wall = 5.0 / np.maximum(np.hypot(rays[:, 1], rays[:, 2]), 1e-9)
@@ -99,32 +88,23 @@ def _in_tube(scan: Scan, rng: np.random.Generator) -> Scan:
     ranges = np.minimum(to_wall, to_floor)
     seen = ranges < 60.0
     ranges = ranges[seen] + rng.normal(scale=0.02, size=int(seen.sum()))
-    labels = np.zeros(int(seen.sum()), np.uint8)
-    times = scan.times[seen] if len(scan.times) else scan.times
-    return replace(
-        scan, points=(rays[seen] * ranges[:, None]).astype(np.float32), labels=labels, times=times, intensities=None
-    )
+    points = (rays[seen] * ranges[:, None]).astype(np.float32)
+    return replace(_kept(scan, seen), points=points, labels=np.zeros(len(points), np.uint8))
 
 
-def with_beams(drive: Drive, every: int) -> Drive:
+def with_beams(scan: Scan, every: int) -> Scan:
     """One beam of so many is kept. The simulator writes beam after beam, each in the order of its azimuths."""
-
-    def thinned(scan: Scan) -> Scan:
-        azimuth = np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0])) % 360.0
-        beam = np.cumsum(np.diff(azimuth, prepend=azimuth[:1]) < -NEXT_BEAM_DEG)
-        return _kept(scan, beam % every == 0)
-
-    return Drive(lambda: (thinned(scan) for scan in drive.scans()), drive.T_world_lidar)
+    beam = np.cumsum(np.diff(_azimuth_deg(scan) % 360.0, prepend=0.0) < -NEXT_BEAM_DEG)
+    return _kept(scan, beam % every == 0)
 
 
-def with_view(drive: Drive, degrees: float) -> Drive:
+def with_view(scan: Scan, degrees: float) -> Scan:
     """The sensor sees a sector ahead only."""
+    return _kept(scan, np.abs(_azimuth_deg(scan)) <= degrees / 2)
 
-    def cut(scan: Scan) -> Scan:
-        azimuth = np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
-        return _kept(scan, np.abs(azimuth) <= degrees / 2)
 
-    return Drive(lambda: (cut(scan) for scan in drive.scans()), drive.T_world_lidar)
+def _azimuth_deg(scan: Scan) -> np.ndarray:
+    return np.degrees(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
 
 
 def _kept(scan: Scan, kept: np.ndarray) -> Scan:
@@ -137,22 +117,17 @@ def _kept(scan: Scan, kept: np.ndarray) -> Scan:
     )
 
 
-def kidnapped(drive: Drive, first: int, to: int) -> Drive:
-    """After one scan the sensor is lifted, and put down at a later place of the drive."""
-    return without(drive, first, to - first)
-
-
-def _row_after(drive: Drive, first: int, metres: float) -> int:
-    steps_m = np.linalg.norm(np.diff(drive.T_world_lidar[:, :3, 3], axis=0), axis=1)
-    along_m = np.concatenate([[0.0], np.cumsum(steps_m)])
-    return int(np.searchsorted(along_m, along_m[first] + metres))
+def _along(drive: Drive, first: int, metres: float) -> range:
+    """The rows from one on, for some metres."""
+    along_m = travelled_m(drive.T_world_lidar)
+    return range(first, int(np.searchsorted(along_m, along_m[first] + metres)))
 
 
 def with_jump(drive: Drive, first: int, metres: float) -> Drive:
     """The true poses are given as odometry, with a jump."""
     poses = drive.T_world_lidar.copy()
     poses[first:] = geometry.transform(np.eye(3), [metres, 0.0, 0.0]) @ poses[first:]
-    return Drive(drive.scans, drive.T_world_lidar, given=poses)
+    return drive._replace(given=poses)
 
 
 def mapped(drive: Drive, config: Config) -> dict[str, float]:
@@ -169,11 +144,11 @@ def mapped(drive: Drive, config: Config) -> dict[str, float]:
     found = accuracy(result, replace(result.trajectory, T_world_lidar=drive.T_world_lidar))
     states = [str(motion.state) for motion in result.motions]
     return {
-        "ate_m": trajectory_metrics(result.trajectory.T_world_lidar, drive.T_world_lidar)["ate_m"],
-        "odometry_ate_m": trajectory_metrics(result.odometry.T_world_lidar, drive.T_world_lidar)["ate_m"],
+        **{name: found[name] for name in ("ate_m", "odometry_ate_m")},
         "num_motions_rejected": len(result.estimate.motion_weights),
         **{name: value for name, value in found.items() if "loop" in name},
-    } | {name: states.count(name) for name in ("repaired", "rejoined", "broken")}
+        **{name: states.count(name) for name in ("repaired", "rejoined", "broken")},
+    }
 
 
 def main() -> None:
@@ -192,18 +167,18 @@ def main() -> None:
     if dataset.reference is None:
         parser.error("the drive has no true poses")
     plain = Drive(lambda: (dataset[row] for row in range(len(dataset))), dataset.reference.T_world_lidar)
-    at = arguments.at
+    at, rng = arguments.at, np.random.default_rng(0)
     troubles: dict[str, Callable[[], Drive]] = {
         "none": lambda: plain,
         "1 s missing": lambda: without(plain, at, 10),
         "2 s missing": lambda: without(plain, at, 20),
         "5 s missing": lambda: without(plain, at, 50),
         "turn of 40 degrees": lambda: turned(plain, at, 40.0),
-        "truck for 50 m": lambda: beside_a_truck(plain, at, 50.0),
-        "tunnel of 100 m": lambda: in_tunnel(plain, at, 100.0),
-        "16 beams": lambda: with_beams(plain, 4),
-        "40 degrees of view": lambda: with_view(plain, 40.0),
-        "kidnapped": lambda: kidnapped(plain, at, arguments.put_down),
+        "truck for 50 m": lambda: changed(plain, beside_a_truck, _along(plain, at, 50.0)),
+        "tunnel of 100 m": lambda: changed(plain, partial(in_tunnel, rng=rng), _along(plain, at, 100.0)),
+        "16 beams": lambda: changed(plain, partial(with_beams, every=4)),
+        "40 degrees of view": lambda: changed(plain, partial(with_view, degrees=40.0)),
+        "kidnapped": lambda: without(plain, at, arguments.put_down - at),
         "given odometry, no jump": lambda: with_jump(plain, at, 0.0),
         "given odometry, jump of 3 m": lambda: with_jump(plain, at, 3.0),
     }

@@ -104,12 +104,8 @@ def align_kiss_matcher(source: Points, target: Points) -> Estimate | Rejected:
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FpfhScan:
-    """Voxel means with their FPFH, (33, n)."""
-
-    points: Points
-    features: np.ndarray
+FpfhScan = tuple[Points, np.ndarray]
+"""Voxel means (n, 3) with their FPFH, (33, n)."""
 
 
 def prepare_fpfh(points: Points) -> FpfhScan:
@@ -121,7 +117,7 @@ def prepare_fpfh(points: Points) -> FpfhScan:
     cloud = _cloud(points).voxel_down_sample(OPEN3D_VOXEL_M)
     cloud.estimate_normals(near(radius=2 * OPEN3D_VOXEL_M, max_nn=30))
     features = tools.compute_fpfh_feature(cloud, near(radius=5 * OPEN3D_VOXEL_M, max_nn=100))
-    return FpfhScan(np.asarray(cloud.points), np.asarray(features.data))
+    return np.asarray(cloud.points), np.asarray(features.data)
 
 
 def align_ransac(source: FpfhScan, target: FpfhScan) -> Estimate | Rejected:
@@ -161,9 +157,9 @@ def _align_features(align: Any, source: FpfhScan, target: FpfhScan, **settings: 
 
     open3d.utility.random.seed(0)
     features = [open3d.pipelines.registration.Feature() for _ in range(2)]
-    for feature, scan in zip(features, (source, target), strict=True):
-        feature.data = scan.features
-    found = align(_cloud(source.points), _cloud(target.points), *features, **settings)
+    for feature, (_, values) in zip(features, (source, target), strict=True):
+        feature.data = values
+    found = align(_cloud(source[0]), _cloud(target[0]), *features, **settings)
     num_inliers = len(found.correspondence_set)
     if num_inliers == 0:
         return Rejected(RejectReason.TOO_FEW_INLIERS, "no consistent point pairs")

@@ -1,14 +1,12 @@
 """Data, methods and settings of a benchmark, and its two units of work: prepare a scan, register a pair."""
 
 import logging
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 from segslam.bench.experiments.baselines import Estimate
 from segslam.bench.experiments.meter import Cost, measured
-from segslam.bench.experiments.methods import METHODS, prepare_parts
+from segslam.bench.experiments.methods import METHODS, Parts, prepare_parts
 from segslam.bench.experiments.pairs import ScanVariant, Trial
 from segslam.bench.experiments.rows import Row
 from segslam.core import geometry
@@ -21,6 +19,7 @@ from segslam.scans import Dataset, DataSource
 
 logger = logging.getLogger(__name__)
 
+LABELS = "labels"
 BAD_SCAN = "bad_scan"
 """Reject reason of a row whose scan cannot be read."""
 
@@ -34,21 +33,10 @@ class Job:
     config: Config
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SharedScan:
-    """The data of one scan that the methods share."""
-
-    values: Mapping[str, Any]
-    """The parts by name."""
-    costs: Mapping[str, Cost]
-    labelling: Cost | None = None
-    """Cost of labels by geometry or network; None for labels from files."""
-
-
-def shared_scan(job: Job, variant: ScanVariant) -> SharedScan | None:
+def shared_scan(job: Job, variant: ScanVariant) -> Parts | None:
     """Read, rotate, label and prepare a scan, and remove some labels; None if the scan cannot be used.
 
-    Geometric labels are those of rotated points.
+    Geometric labels are those of rotated points. The cost of labels that are not from files is that of part LABELS.
     """
     dataset, row_of_scan = open_once(job.source)
     try:
@@ -56,15 +44,15 @@ def shared_scan(job: Job, variant: ScanVariant) -> SharedScan | None:
     except BadScan as error:
         logger.warning("scan %d skipped: %s", variant.index, error)
         return None
-    points, labels, labelling = variant.turned(scan.points), scan.labels, None
-    if callable(labels):
-        with measured() as labelling:
+    points, labels = variant.turned(scan.points), scan.labels
+    with measured() as cost:
+        is_computed = callable(labels)
+        if callable(labels):
             labels = labels()
-    elif dataset.labels.geometric and not labels.any():
-        with measured() as labelling:
+        elif is_computed := dataset.labels.geometric and not labels.any():
             labels = geometric_labels(points)
     values, costs = prepare_parts(points, variant.remaining(labels), methods=job.methods, config=job.config)
-    return SharedScan(values, costs, labelling)
+    return values, costs | ({LABELS: cost} if is_computed else {})
 
 
 def points_of(source: DataSource, variant: ScanVariant) -> Points:
@@ -74,7 +62,7 @@ def points_of(source: DataSource, variant: ScanVariant) -> Points:
     return variant.turned(scan.points)
 
 
-def register_trial(job: Job, trial: Trial, source: SharedScan | None, target: SharedScan | None) -> list[Row]:
+def register_trial(job: Job, trial: Trial, source: Parts | None, target: Parts | None) -> list[Row]:
     """Rows of all methods of the job for one pair, from the same prepared scans."""
     if source is None or target is None:
         return [failed_row(method, trial, BAD_SCAN) for method in job.methods]
@@ -88,13 +76,14 @@ def open_once(source: DataSource) -> tuple[Dataset, dict[int, int]]:
     return dataset, {int(index): row for row, index in enumerate(dataset.scan_index)}
 
 
-def _register(method: str, config: Config, trial: Trial, both: tuple[SharedScan, SharedScan]) -> Row:
+def _register(method: str, config: Config, trial: Trial, both: tuple[Parts, Parts]) -> Row:
     watch = Stopwatch()
     with measured() as cost:
-        outcome = METHODS[method].align(both[0].values, both[1].values, config, watch)
-    costs = [shared.costs[name] for shared in both for name in METHODS[method].parts]
-    uses_labels = any(part.endswith("description") for part in METHODS[method].parts)
-    labelled = [shared.labelling for shared in both if shared.labelling and uses_labels]
+        outcome = METHODS[method].align(both[0][0], both[1][0], config, watch)
+    parts = METHODS[method].parts
+    costs = [costs_of[name] for _, costs_of in both for name in parts]
+    uses_labels = any(part.endswith("description") for part in parts)
+    labelled = [costs_of[LABELS] for _, costs_of in both if LABELS in costs_of and uses_labels]
     reason = outcome.reason.value if isinstance(outcome, Rejected) else ""
     return failed_row(method, trial, reason).model_copy(
         update=_times(cost, costs, labelled, watch) | ({} if isinstance(outcome, Rejected) else _found(outcome, trial))

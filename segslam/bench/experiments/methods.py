@@ -20,6 +20,8 @@ from segslam.registration.prepared import PreparedScan
 
 Values = Mapping[str, Any]
 """The parts of one scan by name."""
+Parts = tuple[dict[str, Any], dict[str, Cost]]
+"""The parts of one scan, and their costs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +68,7 @@ PARTS: dict[str, Callable[[Points, Labels, Config], Any]] = {
 """The parts by name, from points, labels and configuration."""
 
 
-def prepare_parts(
-    points: Points, labels: Labels, *, methods: Iterable[str], config: Config
-) -> tuple[dict[str, Any], dict[str, Cost]]:
+def prepare_parts(points: Points, labels: Labels, *, methods: Iterable[str], config: Config) -> Parts:
     """All parts of a scan that these methods need, each computed once, and their costs."""
     values, costs = {}, {}
     for name in dict.fromkeys(part for method in methods for part in METHODS[method].parts):

@@ -187,13 +187,14 @@ def pair_trials(
     """The trials of each pair; by default one, of the unchanged scans.
 
     The source is rotated about z in steps of `step_deg`. Each of the shares `lost_percent` of its labels is removed
-    `num_draws` times at random, with `both` also from the target. Raises SegslamError for a pair without known true
-    pose.
+    `num_draws` times at random (a share of 0 once), with `both` also from the target. Raises SegslamError for a pair
+    without known true pose.
     """
     trials = []
     draws = range(seed * num_draws, (seed + 1) * num_draws)
+    losses = [(percent, draw) for percent in lost_percent for draw in (draws if percent else (0,))]
     for (source, target), T_target_source in true_poses(pairs, reference).items():
-        for yaw_deg, percent, draw in product(np.arange(0.0, 360.0, step_deg), lost_percent, draws):
+        for yaw_deg, (percent, draw) in product(np.arange(0.0, 360.0, step_deg), losses):
             moved = ScanVariant(source, float(yaw_deg), percent / 100, draw)
             fixed = ScanVariant(target, lost=percent / 100, draw=draw) if both else ScanVariant(target)
             T_true = fixed.T_variant_scan @ T_target_source @ geometry.inverse(moved.T_variant_scan)

@@ -1,6 +1,7 @@
 """One row per registration, written to a CSV file at once and read to resume a benchmark; statistics of rows."""
 
 import csv
+import math
 from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TextIO
@@ -57,9 +58,14 @@ class Row(BaseModel):
     @property
     def success(self) -> bool:
         """True for an error below 2 m and 5 degrees, the paper's criterion."""
+        return self.accepted and self.error.success
+
+    @property
+    def error(self) -> PoseError:
+        """Infinite where no pose was given."""
         if self.error_m is None or self.error_deg is None:
-            return False
-        return self.accepted and PoseError(self.error_m, self.error_deg).success
+            return PoseError(math.inf, math.inf)
+        return PoseError(self.error_m, self.error_deg)
 
     @property
     def key(self) -> tuple[str, ScanVariant, ScanVariant, str]:

@@ -120,17 +120,16 @@ class MovingCar:
 
 def moving_cars(route: Route, config: WorldConfig, rng: np.random.Generator) -> list[MovingCar]:
     """Oncoming cars and cars ahead, each of which meets the sensor at a random time of the drive."""
-    count = rng.poisson(config.moving_cars * route.travel_m[-1] / 100.0)
-    return [_moving_car(route, rng) for _ in range(count)]
-
-
-def _moving_car(route: Route, rng: np.random.Generator) -> MovingCar:
-    row = int(rng.integers(len(route.time_s)))
-    oncoming = rng.uniform() < ONCOMING
-    speed = -rng.uniform(6.0, 12.0) if oncoming else rng.uniform(8.0, 13.0)
-    ahead = 0.0 if oncoming else rng.uniform(15.0, 30.0)
-    start = route.travel_m[row] - speed * route.time_s[row] + ahead
-    return MovingCar(objects.car(rng, Label.MOVING_CAR), float(start), float(speed), LANE_M if oncoming else 0.0)
+    cars = []
+    for _ in range(rng.poisson(config.moving_cars * route.travel_m[-1] / 100.0)):
+        row = int(rng.integers(len(route.time_s)))
+        oncoming = rng.uniform() < ONCOMING
+        speed = -rng.uniform(6.0, 12.0) if oncoming else rng.uniform(8.0, 13.0)
+        ahead = 0.0 if oncoming else rng.uniform(15.0, 30.0)
+        start = route.travel_m[row] - speed * route.time_s[row] + ahead
+        lateral_m = LANE_M if oncoming else 0.0
+        cars.append(MovingCar(objects.car(rng, Label.MOVING_CAR), float(start), float(speed), lateral_m))
+    return cars
 
 
 def meshes_at(

@@ -2,8 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Collection, Iterable, Iterator
-from itertools import count
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from segslam.core import geometry
 from segslam.core.errors import reason
 from segslam.core.geometry import raise_beams
 from segslam.core.trajectory import camera_from_lidar
-from segslam.core.types import SegslamError, Transform, WorkFailed
+from segslam.core.types import SegslamError, WorkFailed
 from segslam.core.whole_files import write_whole
 from segslam.labels.encodings import RAW_OF_LABEL
 from segslam.scans.kitti import VERTICAL_ANGLE_DEG, parse_calibration
@@ -30,7 +29,7 @@ def prepare_folder(out: Path, sequence: str, *, overwrite: bool) -> None:
     An existing sequence is removed if it was simulated and `overwrite` is set. Raises SegslamError, naming the folder,
     otherwise; real data is never removed.
     """
-    if Path(sequence).name != sequence or not sequence:
+    if Path(sequence).name != sequence or sequence in ("", ".."):
         raise SegslamError(f"--sequence {sequence}: must be a plain name such as 00")
     folder, poses = out / "sequences" / sequence, out / "poses" / f"{sequence}.txt"
     there = next((path for path in (folder, poses) if path.exists()), None)
@@ -63,48 +62,29 @@ def write_drive(
 
     The streets follow `drive`; the sensor follows `driven` if it is given. In both cases poses are in the frame of the
     first pose of `drive`, so that several drives through one town share one frame. If `only` is given, only these scans
-    are written, but the times and poses of all. The world is built for the whole drive, so a shorter simulation has
-    the same scans. The settings and the seed are written beside the scans.
+    are written, but the times and poses of all up to the last. The world is built for the whole drive, so a shorter
+    simulation has the same scans. The settings and the seed are written beside the scans.
+    If writing is interrupted, the folder holds a shorter but complete sequence: a scan is written after its labels,
+    time and pose. Raises WorkFailed, with the number of scans, if the disk is full.
     """
+    folder = out / "sequences" / sequence
     settings = {"seed": seed, "config": config.model_dump(mode="json")}
-    write_whole(out / "sequences" / sequence / SETTINGS_FILE, json.dumps(settings, indent=1) + "\n")
+    write_whole(folder / SETTINGS_FILE, json.dumps(settings, indent=1) + "\n")
     world = build_world(drive.T_world_lidar, drive.time_s, config=config.world, seed=seed)
     driven = driven or drive
+    write_whole(folder / "calib.txt", driven.calib)
+    T_first_lidar = geometry.inverse(drive.T_world_lidar[0]) @ driven.T_world_lidar
+    T_first_camera = camera_from_lidar(T_first_lidar, parse_calibration(driven.calib, folder / "calib.txt"))
     numbers = [index for index in range(num_frames or len(driven.time_s)) if only is None or index in only]
     sweeps = drive_sweeps(
         world, driven.T_world_lidar, driven.time_s, config=config.sensor, seed=seed, only=frozenset(numbers)
     )
-    yield from write_sequence(out, sequence, driven, sweeps, numbers=numbers, T_world_origin=drive.T_world_lidar[0])
-
-
-def write_sequence(
-    out: Path,
-    sequence: str,
-    drive: Drive,
-    sweeps: Iterable[Sweep],
-    *,
-    numbers: Iterable[int] | None = None,
-    T_world_origin: Transform | None = None,
-) -> Iterator[int]:
-    """Write sweeps into a prepared folder; yields the number of scans done.
-
-    `numbers`: numbers of the scans, ascending; 0, 1, ... by default. Times and poses have no gaps up to the last scan.
-    If writing is interrupted, the folder holds a shorter but complete sequence: a scan is written after its labels,
-    time and pose. Raises WorkFailed, with the number of scans, if the disk is full.
-    Poses are those of the camera, in the frame of its first pose, or of the camera at the LiDAR pose `T_world_origin`.
-    """
-    folder = out / "sequences" / sequence
-    write_whole(folder / "calib.txt", drive.calib)
-    T_camera_lidar = parse_calibration(drive.calib, folder / "calib.txt")
-    origin = drive.T_world_lidar[0] if T_world_origin is None else T_world_origin
-    T_first_lidar = geometry.inverse(origin) @ drive.T_world_lidar
-    T_first_camera = camera_from_lidar(T_first_lidar, T_camera_lidar)
     done = next_line = 0
     try:
         with (folder / "times.txt").open("w") as times, (out / "poses" / f"{sequence}.txt").open("w") as poses:
-            for index, one in zip(count() if numbers is None else numbers, sweeps, strict=False):
+            for index, one in zip(numbers, sweeps, strict=False):
                 for line in range(next_line, index + 1):
-                    print(f"{drive.time_s[line]:.6e}", file=times)
+                    print(f"{driven.time_s[line]:.6e}", file=times)
                     print(" ".join(f"{value:.9e}" for value in T_first_camera[line, :3].ravel()), file=poses)
                 next_line = index + 1
                 times.flush()

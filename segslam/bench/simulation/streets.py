@@ -42,35 +42,21 @@ def furnish(site: Site, frontage: Frontage, config: WorldConfig, rng: np.random.
         yield from _shrubs(lot, BACKDROP_SHRUBS * config.shrubs, BACKDROP_M, rng)
     equal = config.equal_tree_rows
     make_tree: Maker = (lambda _: objects.tree(np.random.default_rng(0), scale=0.5)) if equal else objects.tree
-    for per_100m, make, distance_m, jitter in (
+    for per_100m, make, distance_m, jitter in (  # jitter: largest displacement along the street, in spacings
         (config.trees, make_tree, TREE_M, 0.0 if equal else 0.8),
         (config.lamps, objects.lamp, LAMP_M, 0.3),
         (config.signs, objects.sign, SIGN_M, 0.9),
         (config.clutter, objects.clutter, TREE_M, 0.9),
     ):
-        yield from _row(site, frontage, per_100m, make, distance_m, rng, jitter=jitter)
-
-
-def _row(
-    site: Site,
-    frontage: Frontage,
-    per_100m: float,
-    make: Maker,
-    distance_m: float,
-    rng: np.random.Generator,
-    *,
-    jitter: float,
-) -> Iterator[Mesh]:
-    """Objects at a mean spacing along the street, each displaced at random by up to `jitter` spacings."""
-    if per_100m <= 0:
-        return
-    spacing = 100.0 / per_100m
-    for nominal in np.arange(spacing / 2, len(frontage.at), spacing):
-        station = int(np.clip(nominal + rng.uniform(-jitter, jitter) * spacing, 0, len(frontage.at) - 1))
-        spot = site.outward(frontage, station, distance_m + rng.uniform(0.0, 1.0) * min(jitter, 0.6))
-        thing = make(rng)
-        if site.claim(spot, 0.5, 0.5, clearance_m=3.0):
-            yield site.stand(thing, spot, turn_rad=float(rng.normal(scale=0.05)))
+        if per_100m <= 0:
+            continue
+        spacing = 100.0 / per_100m
+        for nominal in np.arange(spacing / 2, len(frontage.at), spacing):
+            station = int(np.clip(nominal + rng.uniform(-jitter, jitter) * spacing, 0, len(frontage.at) - 1))
+            spot = site.outward(frontage, station, distance_m + rng.uniform(0.0, 1.0) * min(jitter, 0.6))
+            thing = make(rng)
+            if site.claim(spot, 0.5, 0.5, clearance_m=3.0):
+                yield site.stand(thing, spot, turn_rad=float(rng.normal(scale=0.05)))
 
 
 def _lots(site: Site, frontage: Frontage, rng: np.random.Generator) -> Iterator[Lot]:

@@ -45,10 +45,7 @@ class World:
 
     def cast(self, T_world_lidar: Transform, directions: Points, *, time_s: float = 0.0) -> Hits:
         """The first hits of rays from the sensor's origin; `directions` (n, 3) are unit vectors in the LiDAR frame."""
-        rays = np.empty((len(directions), 6), dtype=np.float32)
-        rays[:, :3] = T_world_lidar[:3, 3]
-        R_world_lidar = T_world_lidar[:3, :3].astype(np.float32)
-        np.einsum("ij,kj->ik", directions.astype(np.float32), R_world_lidar, out=rays[:, 3:])  # faster than BLAS
+        rays = rays_of(T_world_lidar, directions)
         hits = cast_mesh(self.scene, self.static, rays)
         rows = np.flatnonzero((hits.labels == Label.TERRAIN) & np.isfinite(hits.range_m))
         ground_at = rays[rows, :2] + hits.range_m[rows, None] * rays[rows, 3:5]
@@ -88,6 +85,15 @@ def build_world(T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, se
 def _numbered(things: list[Mesh]) -> list[Mesh]:
     """Meshes with one instance number each, on triangles of the classes that have instances in SemanticKITTI."""
     return [as_instance(thing, number, only=NUMBERED) for number, thing in enumerate(things, start=1)]
+
+
+def rays_of(T_world_lidar: Transform, directions: Points) -> np.ndarray:
+    """(n, 6) float32: origin and direction in the world of rays from the sensor; `directions` in the LiDAR frame."""
+    rays = np.empty((len(directions), 6), dtype=np.float32)
+    rays[:, :3] = T_world_lidar[:3, 3]
+    R_world_lidar = T_world_lidar[:3, :3].astype(np.float32)
+    np.einsum("ij,kj->ik", directions.astype(np.float32), R_world_lidar, out=rays[:, 3:])  # faster than BLAS
+    return rays
 
 
 def scene_of(part: Mesh) -> o3d.t.geometry.RaycastingScene:

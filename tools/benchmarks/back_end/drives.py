@@ -1,8 +1,9 @@
 """Keyframes of real drives: levelled ground truth, and measured or simulated odometry."""
 
-import itertools
-from collections.abc import Iterable
+import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,8 @@ from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.evaluation import trajectory_metrics
 from segslam.core.trajectory import lidar_from_camera, read_poses, travelled_m
-from segslam.core.types import Alignment, LoopClosure, Registration
+from segslam.core.types import Alignment, GraphEstimate, LoopClosure, Registration
+from segslam.graph import PoseGraph
 from segslam.graph.noise import odometry_information
 from segslam.keyframes import KeyframeSelector
 from segslam.scans.kitti import read_calibration
@@ -26,9 +28,12 @@ RATE_SIGMAS = geometry.tangent(rotation_rad=np.radians(0.0005), translation_m=0.
 RATE_MEMORY_M = 200.0
 
 
+FIGURES = ("ate_m", "height_m", "kitti_translation_percent")
+
+
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """The keyframes of a drive."""
+    """The keyframes of a drive: true poses and odometry (n, 4, 4), travel (n,)."""
 
     truth: np.ndarray
     odometry: np.ndarray
@@ -36,31 +41,43 @@ class Drive:
 
     def errors(self, poses: np.ndarray) -> dict[str, float]:
         metrics = trajectory_metrics(poses, self.truth)
-        return {"ate_m": metrics["ate_m"], "height_m": metrics["height_m"]}
+        return {name: metrics[name] for name in FIGURES if name in metrics}
 
-    def closure(self, source: int, target: int, rng: np.random.Generator) -> LoopClosure:
-        """The true relative pose of two keyframes, with noise."""
-        return closure(source, target, geometry.inverse(self.truth[target]) @ self.truth[source], rng)
+    def true(self, target: int, source: int) -> np.ndarray:
+        """T_target_source of two keyframes."""
+        return geometry.inverse(self.truth[target]) @ self.truth[source]
+
+    def exact(self, source: int, target: int) -> LoopClosure:
+        """An exact loop with the information of a noisy one."""
+        return closure(source, target, self.true(target, source))
+
+    def graph(self) -> PoseGraph:
+        """The odometry alone."""
+        graph = PoseGraph(CONFIG.graph)
+        for keyframe_id, (T_odom_keyframe, travel_m) in enumerate(zip(self.odometry, self.travel_m, strict=True)):
+            graph.add_keyframe(keyframe_id, T_odom_keyframe, float(travel_m))
+        return graph
+
+    def finished(self, closures: Iterable[LoopClosure]) -> tuple[GraphEstimate, dict[str, float], float]:
+        """The result of the final optimisation with these closures, the errors after it, and its seconds."""
+        graph = self.graph()
+        for loop in closures:
+            graph.add_closure(loop)
+        started = time.perf_counter()
+        estimate = graph.finish()
+        seconds = time.perf_counter() - started
+        return estimate, self.errors(graph.T_world_keyframes), seconds
 
 
-def closure(source: int, target: int, T_target_source: np.ndarray, rng: np.random.Generator) -> LoopClosure:
-    """A loop with noise according to its information."""
-    return exact_closure(source, target, T_target_source @ geometry.exp(CLOSURE_SIGMAS * rng.normal(size=6)))
-
-
-def exact_closure(source: int, target: int, T_target_source: np.ndarray) -> LoopClosure:
-    """An exact loop with the information of a noisy one."""
+def closure(
+    source: int, target: int, T_target_source: np.ndarray, rng: np.random.Generator | None = None
+) -> LoopClosure:
+    """A loop, with noise according to its information if there is an `rng`."""
+    if rng is not None:
+        T_target_source = T_target_source @ geometry.exp(CLOSURE_SIGMAS * rng.normal(size=6))
     registration = Registration(T_target_source, 0, 0, 0.0, np.diag(CLOSURE_SIGMAS**-2.0))
     alignment = Alignment(registration, registration, 1.0, 0.0, 0.0)
     return LoopClosure(source, target, T_target_source, registration.information, alignment)
-
-
-def exact(loops: Iterable[LoopClosure], truth: np.ndarray) -> list[LoopClosure]:
-    """Exact loops between the same keyframes."""
-    return [
-        exact_closure(loop.source_id, loop.target_id, geometry.inverse(truth[loop.target_id]) @ truth[loop.source_id])
-        for loop in loops
-    ]
 
 
 def read_drive(data: Path, sequence: str, odometry: str, rng: np.random.Generator) -> Drive:
@@ -81,25 +98,32 @@ def read_drive(data: Path, sequence: str, odometry: str, rng: np.random.Generato
 
 def drifting(truth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Odometry with a random error at each step and one that varies slowly along the way."""
-    poses, rate = [truth[0]], RATE_SIGMAS * rng.normal(size=6)
-    for T_a, T_b in itertools.pairwise(truth):
-        T_a_b = geometry.inverse(T_a) @ T_b
+    rate = RATE_SIGMAS * rng.normal(size=6)
+
+    def error(T_a_b: np.ndarray) -> np.ndarray:
+        nonlocal rate
         way_m = geometry.distance(T_a_b)
         kept = np.exp(-way_m / RATE_MEMORY_M)
         rate = kept * rate + np.sqrt(1.0 - kept**2) * RATE_SIGMAS * rng.normal(size=6)
-        error = rate * way_m + STEP_SIGMAS * np.sqrt(way_m) * rng.normal(size=6)
-        poses.append(poses[-1] @ T_a_b @ geometry.exp(error))
-    return np.array(poses)
+        return rate * way_m + STEP_SIGMAS * np.sqrt(way_m) * rng.normal(size=6)
+
+    return _with_errors(truth, error)
 
 
 def claimed(truth: np.ndarray, rng: np.random.Generator, *, times: float) -> np.ndarray:
     """Odometry with errors of `times` the graph's noise model."""
-    poses = [truth[0]]
-    for T_a, T_b in itertools.pairwise(truth):
-        T_a_b = geometry.inverse(T_a) @ T_b
+
+    def error(T_a_b: np.ndarray) -> np.ndarray:
         information = odometry_information(geometry.distance(T_a_b), T_a_b, CONFIG.graph)
-        poses.append(poses[-1] @ T_a_b @ geometry.exp(times * np.diag(information) ** -0.5 * rng.normal(size=6)))
-    return np.array(poses)
+        return times * np.diag(information) ** -0.5 * rng.normal(size=6)
+
+    return _with_errors(truth, error)
+
+
+def _with_errors(truth: np.ndarray, error: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    motions = (geometry.inverse(T_a) @ T_b for T_a, T_b in pairwise(truth))
+    steps = (T_a_b @ geometry.exp(error(T_a_b)) for T_a_b in motions)
+    return np.array(list(accumulate(steps, np.matmul, initial=truth[0])))
 
 
 def _lidar_poses(path: Path, T_camera_lidar: np.ndarray) -> np.ndarray:

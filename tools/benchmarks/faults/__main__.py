@@ -20,7 +20,7 @@ import numpy as np
 
 from segslam.scans import open_dataset
 from tools.benchmarks import common
-from tools.benchmarks.faults.episodes import Outcome, disk_episode, live_episode, map_episode, topic_episode
+from tools.benchmarks.faults.episodes import EPISODES, Outcome
 
 MOST_POINTS = 8000
 """Chosen: points of a scan, so that a run with a fault takes seconds."""
@@ -33,43 +33,30 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--every", type=float, default=0.5, help="seconds between two scans of a live run")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", choices=("live", "map", "disk", "topic"))
+    parser.add_argument("--only", choices=EPISODES)
     chosen = parser.parse_args()
     chosen.out.mkdir(parents=True)
     dataset = open_dataset(chosen.data, labels="none", vertical_angle_deg=0.0)
-    scans = [_rows(dataset[row].points) for row in range(min(len(dataset), 40))]
-    outcomes = run_all(scans, chosen.out, chosen.seconds, every_s=chosen.every, seed=chosen.seed, only=chosen.only)
+    scans = []
+    for row in range(min(len(dataset), 40)):
+        points = dataset[row].points
+        some = points[:: 1 + len(points) // MOST_POINTS]
+        scans.append(np.column_stack([some, np.zeros(len(some))]).astype(np.float32))
+    rng, end = random.Random(chosen.seed), monotonic() + chosen.seconds
+    outcomes: list[Outcome] = []
+    kinds = [chosen.only] if chosen.only else [kind for kind in EPISODES if kind != "topic" or find_spec("rclpy")]
+    while not outcomes or monotonic() < end:
+        kind = kinds[len(outcomes) % len(kinds)]
+        folder = chosen.out / f"{len(outcomes):03d}-{kind}"
+        folder.mkdir()
+        outcomes.append(EPISODES[kind](scans, folder, rng, chosen.every))
+        print(f"{folder.name}: {outcomes[-1]}", file=sys.stderr, flush=True)
     figures = summary(outcomes)
     if find_spec("rclpy") is None:
         figures["skipped"] = "topics that stop: rclpy is not installed"
     common.write_report(chosen.out / "bench.json", figures)
     print(json.dumps(figures, indent=2))
     sys.exit(1 if figures["problems"] or figures["num_unaccounted"] else 0)
-
-
-def run_all(
-    scans: list[np.ndarray], out: Path, seconds: float, *, every_s: float, seed: int, only: str | None = None
-) -> list[Outcome]:
-    """Episodes in turn, until the time is over."""
-    rng, end = random.Random(seed), monotonic() + seconds
-    outcomes: list[Outcome] = []
-    kinds = [only] if only else ["live", "map", "disk", *(["topic"] if find_spec("rclpy") else [])]
-    while not outcomes or monotonic() < end:
-        kind = kinds[len(outcomes) % len(kinds)]
-        folder = out / f"{len(outcomes):03d}-{kind}"
-        folder.mkdir(parents=True)
-        match kind:
-            case "live":
-                outcome = live_episode(scans, folder, rng, every_s=every_s)
-            case "map":
-                outcome = map_episode(scans, folder, rng)
-            case "disk":
-                outcome = disk_episode(scans, folder, rng, every_s=every_s)
-            case _:
-                outcome = topic_episode(scans, folder, rng, every_s=every_s)
-        print(f"{folder.name}: {outcome}", file=sys.stderr, flush=True)
-        outcomes.append(outcome)
-    return outcomes
 
 
 def summary(outcomes: list[Outcome]) -> dict[str, Any]:
@@ -83,12 +70,6 @@ def summary(outcomes: list[Outcome]) -> dict[str, Any]:
         "num_unaccounted": sum(outcome.num_unaccounted for outcome in outcomes),
         "problems": [problem for outcome in outcomes for problem in outcome.problems],
     }
-
-
-def _rows(points: np.ndarray) -> np.ndarray:
-    """Some points of a scan, with an intensity."""
-    some = points[:: 1 + len(points) // MOST_POINTS]
-    return np.column_stack([some, np.zeros(len(some))]).astype(np.float32)
 
 
 if __name__ == "__main__":

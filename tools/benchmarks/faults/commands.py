@@ -24,6 +24,7 @@ class Command:
     """A segslam command, its output read as it comes."""
 
     def __init__(self, *words: object) -> None:
+        self.name = words[0]
         command = [sys.executable, "-m", "segslam", *map(str, words)]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         self.lines: list[str] = []

@@ -17,6 +17,12 @@ def write_whole(folder: Path, rows: np.ndarray, name: str) -> Path:
     return part.rename(file)
 
 
+def whole(folder: Path, rows: np.ndarray, name: str, rng: random.Random) -> int:
+    """A file without a fault."""
+    write_whole(folder, rows, name)
+    return 1
+
+
 def cut(folder: Path, rows: np.ndarray, name: str, rng: random.Random) -> int:
     """A file that ends anywhere."""
     content = rows.astype("<f4").tobytes()
@@ -79,14 +85,12 @@ def odd_points(folder: Path, rows: np.ndarray, name: str, rng: random.Random) ->
             odd = odd[: rng.randrange(1, 60)]
         case _:
             odd[:] = odd[0]
-    write_whole(folder, odd, name)
-    return 1
+    return whole(folder, odd, name, rng)
 
 
 def overwritten(folder: Path, rows: np.ndarray, name: str, rng: random.Random) -> int:
     """A name that is used again: the recorder's `latest.bin`."""
-    write_whole(folder, rows, "latest.bin")
-    return 1
+    return whole(folder, rows, "latest.bin", rng)
 
 
 def clock_set_back(folder: Path, rows: np.ndarray, name: str, rng: random.Random) -> int:
@@ -101,15 +105,12 @@ def clock_set_back(folder: Path, rows: np.ndarray, name: str, rng: random.Random
 
 def odd_stamp(folder: Path, rows: np.ndarray, name: str, rng: random.Random) -> int:
     """A name that is read as a stamp, of no time."""
-    write_whole(folder, rows, f"{rng.randrange(5 * 10**18, 10**19):019d}.bin")
-    return 1
+    return whole(folder, rows, f"{rng.randrange(5 * 10**18, 10**19):019d}.bin", rng)
 
 
 FileFault = Callable[[Path, np.ndarray, str, random.Random], int]
 """Writes a scan with a fault into a folder under a name; returns the number of scans that a watcher sees."""
-LIVE: dict[str, FileFault] = {
-    fault.__name__: fault
-    for fault in (*(cut, empty, deleted, renamed, wrong_type, odd_points, overwritten, clock_set_back, odd_stamp),)
-}
-OFFLINE: dict[str, FileFault] = {fault.__name__: fault for fault in (cut, empty, odd_points)}
+FAULTS = (cut, empty, deleted, renamed, wrong_type, odd_points, overwritten, clock_set_back, odd_stamp)
+LIVE: dict[str, FileFault] = {fault.__name__: fault for fault in FAULTS}
+OFFLINE = [fault.__name__ for fault in (cut, empty, odd_points)]
 """Those that a folder shows to `segslam map`."""

@@ -16,39 +16,36 @@ import argparse
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
 
+from segslam.candidates import Places, PlaceSignature
 from tools.benchmarks.common import Row, markdown, parser, write_report
-from tools.benchmarks.fleet.search import search_costs
-from tools.benchmarks.fleet.towns import NUM_FRAMES, drives_in, write_list, write_towns
+from tools.benchmarks.fleet.towns import NUM_FRAMES, drives_in, fleet_command, write_list, write_towns
 from tools.benchmarks.fleet.troubles import troubles
 
-COMMAND = (sys.executable, "-m", "segslam", "fleet")
+NUM_QUERIES = 20
 
 
 def main() -> None:
     """Run one of the benchmarks."""
     options = parser(__doc__, "fleet")
     kinds = options.add_subparsers(dest="kind", required=True)
-    simulate = kinds.add_parser("simulate")
+    simulate, growth, trouble, search = map(kinds.add_parser, ("simulate", "growth", "troubles", "search"))
     simulate.add_argument("poses", type=Path)
     simulate.add_argument("towns", type=Path)
     simulate.add_argument("--frames", type=int, default=NUM_FRAMES)
-    for name in ("growth", "troubles"):
-        kind = kinds.add_parser(name)
+    for kind in (growth, trouble):
         kind.add_argument("towns", type=Path)
         kind.add_argument("out", type=Path)
-    kinds.choices["growth"].add_argument("--numbers", default="4,8,16,23")
-    search = kinds.add_parser("search")
+    growth.add_argument("--numbers", default="4,8,16,23")
+    growth.add_argument("--workers", default="1")
+    trouble.add_argument("--number", type=int, default=4)
     search.add_argument("fleet", type=Path)
     search.add_argument("--numbers", default="10000,100000,1000000")
-    kinds.choices["growth"].add_argument("--workers", default="1")
-    kinds.choices["troubles"].add_argument("--number", type=int, default=4)
     given = options.parse_args()
     if given.kind == "simulate":
         for name in write_towns(given.towns, given.poses, num_frames=given.frames):
@@ -57,7 +54,7 @@ def main() -> None:
         _growth(given)
     elif given.kind == "search":
         signatures = np.concatenate([np.load(file) for file in sorted((given.fleet / "index").glob("*.npy"))])
-        print(markdown("Search", search_costs(signatures, list(map(int, given.numbers.split(","))))))
+        print(markdown("Search", _search_costs(signatures, list(map(int, given.numbers.split(","))))))
     else:
         given.out.mkdir(parents=True, exist_ok=True)
         rows = troubles(given.out, drives_in(given.towns)[: given.number])
@@ -90,7 +87,7 @@ def _growth(given: argparse.Namespace) -> None:
 def _run(folder: Path, drives: list[Path], workers: str) -> dict[str, Any]:
     """`fleet.json` of a call, and what it cost."""
     listed = write_list(folder.with_suffix(".yaml"), drives)
-    arguments = [*COMMAND, str(listed), "--out", str(folder), "--same-reference", "--workers", workers, "-q"]
+    arguments = fleet_command(listed, folder, "--workers", workers)
     started = perf_counter()
     _, status, used = os.wait4(subprocess.Popen(arguments).pid, 0)
     if status:
@@ -111,6 +108,22 @@ def _row(name: str, number: int, ran: dict[str, Any]) -> Row:
         "largest process (MB)": round(ran["peak_mb"]),
         "disk a drive (MB)": round(ran["bytes"] / 1e6 / number, 1),
     } | steps
+
+
+def _search_costs(signatures: np.ndarray, numbers: list[int]) -> list[Row]:
+    """A row for each number of places. `signatures`: (n, 24, 60) of an index, repeated at other yaws."""
+    places, rows, rng = Places(), list[Row](), np.random.default_rng(0)
+    for number in numbers:
+        while len(places) < number:
+            drawn = np.roll(signatures[rng.integers(len(signatures))], rng.integers(60), axis=1)
+            places.add(len(places), PlaceSignature(drawn))
+        started = process_time()
+        for query in signatures[:: max(1, len(signatures) // NUM_QUERIES)][:NUM_QUERIES]:
+            places.shortlist(PlaceSignature(query))
+        query_ms = round((process_time() - started) / NUM_QUERIES * 1e3, 2)
+        megabytes = round(number * places.bytes_per_place / 1e6)
+        rows.append({"places": number, "CPU a query (ms)": query_ms, "MB": megabytes})
+    return rows
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Simulated drives through parts of KITTI's routes: four days in each town, both directions, another lane."""
 
 import json
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,9 +18,9 @@ FIRST = 100
 SEED = 3501
 
 
-def write_towns(out: Path, poses: Path, *, num_frames: int = NUM_FRAMES, towns: Sequence[str] = TOWNS) -> Iterator[str]:
+def write_towns(out: Path, poses: Path, *, num_frames: int) -> Iterator[str]:
     """Write the drives of all towns, and the whole of each in one drive; yields the names of folders."""
-    for town in towns:
+    for town in TOWNS:
         road = read_drive(poses / f"{town}.txt", sequence=town)
         road = _part(road, slice(FIRST, FIRST + num_frames))
         scale = num_frames / NUM_FRAMES
@@ -39,6 +40,12 @@ def drives_in(folder: Path, *, whole: bool = False) -> list[Path]:
     """The drives that were written, one town after the other; with `whole` those that map a town at once."""
     found = sorted(path for path in folder.iterdir() if (path / "sequences").is_dir())
     return [path for path in found if path.name.endswith("_whole") == whole]
+
+
+def fleet_command(listed: Path, out: Path, *options: str) -> list[str]:
+    """`segslam fleet` with the drives of a list, all in the frame of their true poses."""
+    words = ("fleet", str(listed), "--out", str(out), "--same-reference", "-q", *options)
+    return [sys.executable, "-m", "segslam", *words]
 
 
 def _write(folder: Path, road: Drive, driven: Drive, town: str, day: int) -> str:

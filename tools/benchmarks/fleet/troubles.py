@@ -9,17 +9,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from tools.benchmarks.common import Row
-from tools.benchmarks.fleet.towns import write_list
+from tools.benchmarks.fleet.towns import fleet_command, write_list
 
 STEPS = {"map_drive": "runs", "index_drive": "index", "propose": "proposals", "relate": "pairs", "join": "component_*"}
 """The functions of `segslam.run.fleets.steps` and the folders that they fill."""
 COMPARED = ("poses_tum.txt", "graph.g2o")
-ADDRESS = "tcp://127.0.0.1:{}"
 FIRST_PORT, WAIT_S = 18700, 1800
 SMALL_DISK = 200_000
 """Bytes of the largest file that a worker with a full disk can write."""
@@ -29,7 +27,7 @@ def troubles(out: Path, drives: Sequence[Path]) -> list[Row]:
     """A row for each trouble: how the command ended, whether the bytes are the same, what was done twice."""
     listed = write_list(out / "drives.yaml", drives)
     reference = out / "reference"
-    subprocess.run(_command(listed, reference, "--workers", "1"), check=True)
+    subprocess.run(fleet_command(listed, reference, "--workers", "1"), check=True)
     rows: list[Row] = []
     for number, step in enumerate((*STEPS, "scheduler: map_drive", "scheduler: relate", "full disk", "damaged drive")):
         rows.append(_Trial(out / f"{number}", reference, listed, FIRST_PORT + number).row(step))
@@ -41,28 +39,27 @@ class _Trial:
     """One trouble in a folder of its own, where the steps before it are finished."""
 
     def __init__(self, folder: Path, reference: Path, listed: Path, port: int) -> None:
-        self._folder, self._reference, self._listed = folder, reference, listed
-        self._address, self._port = ADDRESS.format(port), port
+        self._folder, self._reference, self._listed, self._port = folder, reference, listed, port
+        self._address = f"tcp://127.0.0.1:{port}"
+        self._command = fleet_command(listed, folder, "--scheduler", self._address)
 
     def row(self, step: str) -> Row:
         """Cause the trouble, call again where the command failed, and compare."""
         first, _, function = step.rpartition(": ")
-        if step in STEPS:
-            statuses, before = self._killed(step, whole_scheduler=False)
-        elif first:
-            statuses, before = self._killed(function, whole_scheduler=True)
-        elif step == "full disk":
+        if step == "full disk":
             statuses, before = self._full_disk()
-        else:
+        elif step == "damaged drive":
             statuses, before = self._damaged()
+        else:
+            statuses, before = self._killed(function, whole_scheduler=bool(first))
         again = [name for name, time_ns in before.items() if Path(name).stat().st_mtime_ns != time_ns]
         return {"trouble": step, "status": statuses, "same bytes": self._same(), "done twice": len(again)}
 
     def _killed(self, function: str, *, whole_scheduler: bool) -> tuple[list[int], dict[str, int]]:
         """SIGKILL while a worker does this step."""
         self._copy_until(function)
-        with self._scheduler() as scheduler, _worker(self._address), _worker(self._address):
-            command = subprocess.Popen(_command(self._listed, self._folder, "--scheduler", self._address))
+        with self._cluster() as scheduler:
+            command = subprocess.Popen(self._command)
             pid = self._working_on(function)
             before = self._finished()
             os.kill(scheduler.pid if whole_scheduler else pid, signal.SIGKILL)
@@ -72,12 +69,11 @@ class _Trial:
         return statuses, before
 
     def _full_disk(self) -> tuple[list[int], dict[str, int]]:
-        with self._scheduler(), _worker(self._address, SMALL_DISK), _worker(self._address):
-            statuses = [subprocess.run(_command(self._listed, self._folder, "--scheduler", self._address)).returncode]
+        status = self._call(most_bytes=SMALL_DISK)
         states = json.loads((self._folder / "fleet.json").read_text())["drives"]
         print({name: one.get("reason", one["state"]) for name, one in states.items()})
         before = {name: time_ns for name, time_ns in self._finished().items() if "component_" not in name}
-        return [*statuses, self._call()], before
+        return [status, self._call()], before
 
     def _damaged(self) -> tuple[list[int], dict[str, int]]:
         """The last drive of the list is a file that is no recording; the others are compared."""
@@ -86,27 +82,27 @@ class _Trial:
         listed = self._folder.with_suffix(".yaml")
         drives = [*json.loads(self._listed.read_text()), {"data": str(bad), "name": "damaged"}]
         listed.write_text(json.dumps(drives))
-        status = subprocess.run(_command(listed, self._folder, "--workers", "1")).returncode
+        status = subprocess.run(fleet_command(listed, self._folder, "--workers", "1")).returncode
         print(json.loads((self._folder / "fleet.json").read_text())["drives"]["damaged"])
         return [status], {}
 
-    def _call(self) -> int:
-        with self._scheduler(), _worker(self._address), _worker(self._address):
-            return subprocess.run(_command(self._listed, self._folder, "--scheduler", self._address)).returncode
+    def _call(self, *, most_bytes: int | None = None) -> int:
+        with self._cluster(most_bytes):
+            return subprocess.run(self._command).returncode
 
     def _copy_until(self, function: str) -> None:
         """What the steps before this one made, from the reference."""
         self._folder.mkdir(parents=True)
-        for step, name in STEPS.items():
-            if step == function:
-                return
+        for name in list(STEPS.values())[: list(STEPS).index(function)]:
             for made in self._reference.glob(name):
                 shutil.copytree(made, self._folder / made.name, copy_function=shutil.copy2)
 
     @contextmanager
-    def _scheduler(self) -> Iterator[subprocess.Popen[bytes]]:
-        arguments = ("scheduler", "--host", "127.0.0.1", "--port", str(self._port), "--no-dashboard", "--no-show")
-        with _process("dask", *arguments) as process:
+    def _cluster(self, most_bytes: int | None = None) -> Iterator[subprocess.Popen[bytes]]:
+        """The process of a scheduler that has two workers; one may be unable to write files of more bytes."""
+        scheduler = ("scheduler", "--host", "127.0.0.1", "--port", str(self._port), "--no-dashboard", "--no-show")
+        worker = ("worker", self._address, "--nthreads", "1", "--no-nanny", "--no-dashboard")
+        with _dask(*scheduler) as process, _dask(*worker, most_bytes=most_bytes), _dask(*worker):
             yield process
 
     def _working_on(self, function: str) -> int:
@@ -143,34 +139,18 @@ class _Trial:
         )
 
 
-def _command(listed: Path, folder: Path, *options: str) -> list[str]:
-    return [*_python("segslam"), "fleet", str(listed), "--out", str(folder), "--same-reference", "-q", *options]
-
-
-def _python(module: str) -> list[str]:
-    return [sys.executable, "-m", module]
-
-
 @contextmanager
-def _process(*arguments: str, most_bytes: int | None = None) -> Iterator[subprocess.Popen[bytes]]:
-    """A process that is killed at the end."""
+def _dask(*words: str, most_bytes: int | None = None) -> Iterator[subprocess.Popen[bytes]]:
+    """A process of Dask that is killed at the end."""
 
     def limit() -> None:
         if most_bytes is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
 
-    process = subprocess.Popen(
-        [*_python(arguments[0]), *arguments[1:]], preexec_fn=limit, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    command = [sys.executable, "-m", "dask", *words]
+    process = subprocess.Popen(command, preexec_fn=limit, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         yield process
     finally:
         process.kill()
         process.wait()
-
-
-@contextmanager
-def _worker(address: str, most_bytes: int | None = None) -> Iterator[subprocess.Popen[bytes]]:
-    arguments: tuple[Any, ...] = ("worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard")
-    with ExitStack() as stack:
-        yield stack.enter_context(_process("dask", *arguments, most_bytes=most_bytes))

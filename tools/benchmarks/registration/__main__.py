@@ -10,6 +10,7 @@ are made where they are needed and kept in DIR, some 1.5 MB each. The gates of `
 """
 
 import argparse
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -22,12 +23,11 @@ from segslam.labels.label_files import computed
 from tools.benchmarks import common, real_pairs
 from tools.benchmarks.common import Row, markdown
 from tools.benchmarks.registration.ablation import Case, ablation
+from tools.benchmarks.registration.attempts import scan_of, simulated
 from tools.benchmarks.registration.real import real, real_negatives
 from tools.benchmarks.registration.scans import BANDS_M, WORLDS, Labelled, SimulatedPlace, real_scan
-from tools.benchmarks.registration.simulated import scan_of, simulated
 from tools.benchmarks.registration.speed import many_correspondences, sizes, stages
 
-PARTS = ("real", "simulated", "negatives", "speed", "ablation")
 Tables = dict[str, list[Row]]
 
 
@@ -39,22 +39,9 @@ def places(options: argparse.Namespace) -> list[SimulatedPlace]:
     ]
 
 
-def real_part(options: argparse.Namespace, config: Config) -> Tables:
-    return {"Real pairs, the source turned": real(options.data, config, num_yaws=options.yaws)}
-
-
 def simulated_part(options: argparse.Namespace, config: Config) -> Tables:
     rng = np.random.default_rng([options.seed, 7])
-    found = simulated(places(options), config, sample=options.sample, num_negatives=options.negatives, rng=rng)
-    return {
-        "Simulated pairs at real poses": found.success,
-        "Gates: simulated scans over 100 m apart, and true pairs rejected": found.gates,
-        "Squared errors by the information claimed": found.information,
-    }
-
-
-def negatives_part(options: argparse.Namespace, config: Config) -> Tables:
-    return {"Real scans that do not overlap": real_negatives(options.data, config, every=options.every)}
+    return simulated(places(options), config, sample=options.sample, num_negatives=options.negatives, rng=rng)
 
 
 def speed_part(options: argparse.Namespace, config: Config) -> Tables:
@@ -92,7 +79,20 @@ def _cases(
     return [(pair, scan) for band_m in bands_m for pair in place.pairs(band_m, sample)]
 
 
-def arguments() -> argparse.Namespace:
+PARTS: dict[str, Callable[[argparse.Namespace, Config], Tables]] = {
+    "real": lambda options, config: {
+        "Real pairs, the source turned": real(options.data, config, num_yaws=options.yaws)
+    },
+    "simulated": simulated_part,
+    "negatives": lambda options, config: {
+        "Real scans that do not overlap": real_negatives(options.data, config, every=options.every)
+    },
+    "speed": speed_part,
+    "ablation": ablation_part,
+}
+
+
+def main() -> None:
     parser = common.parser(__doc__, "registration")
     parser.add_argument("data", type=Path)
     parser.add_argument("--cache", type=Path, required=True, help="simulated scans are kept here")
@@ -109,24 +109,12 @@ def arguments() -> argparse.Namespace:
     unknown = set(options.parts.split(",")) - set(PARTS)
     if unknown:
         parser.error(f"--parts {','.join(sorted(unknown))}: choose from {','.join(PARTS)}")
-    return options
-
-
-def main() -> None:
-    options = arguments()
     keep_freed_memory()  # as the commands do
     config = load_config(overrides=options.set)
-    parts = {
-        "real": real_part,
-        "simulated": simulated_part,
-        "negatives": negatives_part,
-        "speed": speed_part,
-        "ablation": ablation_part,
-    }
     asked = {key: str(value) for key, value in vars(options).items() if key not in ("data", "cache", "out")}
     tables: Tables = {}
     for name in options.parts.split(","):
-        for title, rows in parts[name](options, config).items():
+        for title, rows in PARTS[name](options, config).items():
             tables[title] = rows
             print(markdown(title, rows), flush=True)
     settings = config.model_dump(mode="json", include={"segregator", "refine", "verify", "geometric"})

@@ -10,7 +10,7 @@ from segslam.core.config import Config, load_config
 from segslam.core.types import Description, Label
 from segslam.registration import segregator
 from tools.benchmarks.common import Row
-from tools.benchmarks.registration.attempts import error_of, percent
+from tools.benchmarks.registration.attempts import error, percent
 from tools.benchmarks.registration.scans import Labelled
 from tools.benchmarks.registration.speed import timed
 
@@ -35,11 +35,8 @@ Case = tuple[Trial, Callable[[int], Labelled]]
 
 def ablation(cases: list[Case], config: Config, *, seed: int) -> list[Row]:
     """A row a variant: success and mean error of coarse poses, labels as they are and with most of them lost."""
-    return [{"variant": name} | _measured(cases, _with(config, changes), seed) for name, changes in VARIANTS.items()]
-
-
-def _with(config: Config, changes: tuple[str, ...]) -> Config:
-    return load_config(overrides=changes, base=config)
+    configs = {name: load_config(overrides=changes, base=config) for name, changes in VARIANTS.items()}
+    return [{"variant": name} | _measured(cases, changed, seed) for name, changed in configs.items()]
 
 
 def _measured(cases: list[Case], config: Config, seed: int) -> Row:
@@ -51,11 +48,11 @@ def _measured(cases: list[Case], config: Config, seed: int) -> Row:
             source, target = described(scan, pair.source.index), described(scan, pair.target.index)
             outcome = segregator.match(source, target, config=config.segregator)
             cpu.append(timed(lambda: segregator.match(source, target, config=config.segregator))[1])  # noqa: B023
-            errors.append(error_of(outcome, pair.T_target_source))
-        good = [error for error in errors if error.success]
+            errors.append(error(outcome, pair.T_target_source))
+        good = [one for one in errors if one.success]
         row |= {
-            f"percent{suffix}": percent([error in good for error in errors]),
-            f"mean_m{suffix}": round(float(np.mean([error.translation_m for error in good])), 3),
+            f"percent{suffix}": percent([one.success for one in errors]),
+            f"mean_m{suffix}": round(float(np.mean([one.translation_m for one in good])), 3),
             f"match_cpu_ms{suffix}": round(1e3 * float(np.median(cpu)), 1),
         }
     return row

@@ -3,7 +3,6 @@
 The latter are all pairs of KITTI 00, and pairs of courtyard and KITTI.
 """
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
@@ -16,12 +15,11 @@ from segslam.bench.experiments import rows
 from segslam.bench.experiments.rows import grouped
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.evaluation import PoseError
 from segslam.core.types import Alignment
 from segslam.verification import register_prepared
 from tools.benchmarks import real_pairs
 from tools.benchmarks.common import Row
-from tools.benchmarks.registration.attempts import error, preparer
+from tools.benchmarks.registration.attempts import error, percent, preparer
 from tools.benchmarks.registration.scans import by_shape, courtyard_points, kitti_pose, real_indices, real_scan
 
 FAR_M = 20.0
@@ -30,10 +28,10 @@ NEAR_BOUND, FAR_BOUND = (0.3, 1.0), (0.5, 2.0)
 REFINED_BOUND = (0.05, 0.2)
 MEET_M = 60.0
 """Scans of KITTI 00 nearer than this share a street corner; they are not negatives."""
-KITTI_ERR_M, KITTI_ERR_DEG = 3.0, 3.0
-"""Chosen: KITTI's ground truth is off by up to 2.2 m and 1.7 degrees between scans 3-10 and 94-95, some 80 m apart, by
-three independent signs: the pairs' own poses close triangles to 0.12 m, tree by tree and corner by corner the clouds
-coincide, and no point stands where the other scan saw through."""
+KITTI_ERR = 3.0, 3.0
+"""m, degrees. Chosen: KITTI's ground truth errs by up to 2.2 m and 1.7 degrees between scans 3-10 and 94-95, some 80 m
+apart, by three independent signs: the pairs' own poses close triangles to 0.12 m, tree by tree and corner by corner the
+clouds coincide, and no point stands where the other scan saw through."""
 NUM_COURTYARD = 100
 
 
@@ -53,26 +51,18 @@ def real(data: Path, config: Config, *, num_yaws: int) -> list[Row]:
 
 def _figures(some: Sequence[rows.Row], apart_m: float) -> Row:
     by_method = grouped(some, lambda row: row.method)
-    coarse = [_error(row) for row in by_method[real_pairs.COARSE]]
-    fine = [_error(row) for row in by_method[real_pairs.REFINED]]
+    coarse, fine = ([row.error for row in by_method[name]] for name in (real_pairs.COARSE, real_pairs.REFINED))
     bound = NEAR_BOUND if apart_m <= FAR_M else FAR_BOUND
     return {
         "apart_m": round(apart_m, 1),
         "yaws": len(fine),
-        "coarse_percent": round(100.0 * float(np.mean([error.within(*bound) for error in coarse])), 1),
+        "coarse_percent": percent([error.within(*bound) for error in coarse]),
         "coarse_worst_m": round(max(error.translation_m for error in coarse), 3),
         "coarse_worst_deg": round(max(error.rotation_deg for error in coarse), 2),
-        "refined_percent": round(100.0 * float(np.mean([error.within(*REFINED_BOUND) for error in fine])), 1),
+        "refined_percent": percent([error.within(*REFINED_BOUND) for error in fine]),
         "refined_worst_m": round(max(error.translation_m for error in fine), 3),
         "refined_worst_deg": round(max(error.rotation_deg for error in fine), 2),
     }
-
-
-def _error(row: rows.Row) -> PoseError:
-    """Infinite where no pose was given."""
-    if row.error_m is None or row.error_deg is None:
-        return PoseError(math.inf, math.inf)
-    return PoseError(row.error_m, row.error_deg)
 
 
 def real_negatives(data: Path, config: Config, *, every: int) -> list[Row]:
@@ -88,7 +78,7 @@ def real_negatives(data: Path, config: Config, *, every: int) -> list[Row]:
         outcome = register_prepared(kitti(source), kitti(target), config=config)
         if not isinstance(outcome, Alignment):
             within[outcome.reason.value] += 1
-        elif error(outcome.fine.T_target_source, T_true).within(KITTI_ERR_M, KITTI_ERR_DEG):
+        elif error(outcome.fine, T_true).within(*KITTI_ERR):
             within["right after all"] += 1
         else:
             within["accepted"] += 1

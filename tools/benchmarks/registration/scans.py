@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from segslam.bench.experiments.job import open_once
-from segslam.bench.experiments.pairs import ScanVariant, Trial
-from segslam.bench.simulation.sensor import Sensor, SweepError, make_sensor, sweep, sweep_errors
-from segslam.bench.simulation.tracks import Drive, read_drive
+from segslam.bench.experiments.pairs import MIN_GAP, ScanVariant, Trial, read_pairs
+from segslam.bench.simulation.sensor import drive_sweeps
+from segslam.bench.simulation.tracks import read_drive
 from segslam.bench.simulation.world import World, build_world
 from segslam.bench.simulation.world_settings import SimulationConfig, WorldConfig
 from segslam.core import geometry
@@ -30,8 +30,6 @@ WORLDS = {
 LISTED_M = {(8, 10): "8to10", (10, 15): "10to15"}
 """Bands of distance that the paper has lists for."""
 BANDS_M = (*LISTED_M, (15, 20), (20, 30))
-MIN_GAP = 50
-"""Scans between the two of a pair, the protocol of the paper's lists."""
 
 
 class SimulatedPlace:
@@ -39,21 +37,16 @@ class SimulatedPlace:
 
     def __init__(self, data: Path, sequence: str, world: str, *, seed: int, cache: Path) -> None:
         self.name = f"{sequence} {world}"
-        self._lists = data / "pairs", f"kitti{sequence}_"
+        self._lists, self._prefix = data / "pairs", f"kitti{sequence}_"
         self._seed, self._hard = seed, world == "hard"
         self._config = SimulationConfig(world=WORLDS[world])
         digest = hashlib.sha256(self._config.model_dump_json().encode()).hexdigest()[:8]
         self._folder = cache / f"{sequence}-{world}-{seed}-{digest}"
-        self._drive: Drive = read_drive(data / "kitti" / "poses" / f"{sequence}.txt", sequence=sequence)
-
-    def distance_m(self, a: int, b: int) -> float:
-        """Between two of its poses, as seen from above."""
-        T_world_lidar = self._drive.T_world_lidar
-        return float(np.linalg.norm(T_world_lidar[a, :2, 3] - T_world_lidar[b, :2, 3]))
+        drive = read_drive(data / "kitti" / "poses" / f"{sequence}.txt", sequence=sequence)
+        self.T_world_lidar, self._time_s = drive.T_world_lidar, drive.time_s
 
     def pair(self, source: int, target: int) -> Trial:
-        T_world_lidar = self._drive.T_world_lidar
-        T_target_source = geometry.inverse(T_world_lidar[target]) @ T_world_lidar[source]
+        T_target_source = geometry.inverse(self.T_world_lidar[target]) @ self.T_world_lidar[source]
         return Trial(self.name, ScanVariant(source), ScanVariant(target), T_target_source)
 
     def pairs(self, band_m: tuple[int, int], count: int) -> list[Trial]:
@@ -77,33 +70,22 @@ class SimulatedPlace:
         return stored["points"], stored["labels"]
 
     def _listed(self, band_m: tuple[int, int]) -> np.ndarray:
-        folder, prefix = self._lists
-        return np.loadtxt(folder / f"{prefix}{LISTED_M[band_m]}.txt", dtype=int)[:, :2]
+        return read_pairs(self._lists / f"{self._prefix}{LISTED_M[band_m]}.txt").pairs
 
     def _cut(self, band_m: tuple[int, int]) -> np.ndarray:
-        at = self._drive.T_world_lidar[:, :2, 3]
+        at = self.T_world_lidar[:, :2, 3]
         early, late = np.triu_indices(len(at), MIN_GAP)
         apart_m = np.linalg.norm(at[early] - at[late], axis=1)
         within = (apart_m >= band_m[0]) & (apart_m < band_m[1])
         return np.column_stack([early[within], late[within]])
 
     @cached_property
-    def _world(self) -> tuple[World, Sensor, list[SweepError]]:
-        drive, config = self._drive, self._config
-        errors = sweep_errors(drive.time_s, config=config.sensor, rng=np.random.default_rng([self._seed, 3]))
-        world = build_world(drive.T_world_lidar, drive.time_s, config=config.world, seed=self._seed)
-        return world, make_sensor(config.sensor, seed=self._seed), list(errors)
+    def _world(self) -> World:
+        return build_world(self.T_world_lidar, self._time_s, config=self._config.world, seed=self._seed)
 
     def _simulated(self, index: int) -> Labelled:
-        world, sensor, errors = self._world
-        swept = sweep(
-            world,
-            sensor,
-            self._drive.T_world_lidar[index],
-            rng=np.random.default_rng([self._seed, 4, index]),
-            time_s=float(self._drive.time_s[index]),
-            error=errors[index],
-        )
+        drive, sensor = (self.T_world_lidar, self._time_s), self._config.sensor
+        (swept,) = drive_sweeps(self._world, *drive, config=sensor, seed=self._seed, only={index})
         rng = np.random.default_rng([self._seed, 5, index])
         wrong = LabelErrorConfig() if self._hard else LabelErrorConfig(regions=0, bleeding=0.0, lost=0.0)
         return swept.points.astype(np.float32), network_like(swept.points, swept.labels, config=wrong, rng=rng)

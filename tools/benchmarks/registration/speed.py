@@ -11,10 +11,9 @@ from segslam.bench.experiments.baselines import align_gicp, prepare_gicp
 from segslam.bench.experiments.meter import measured
 from segslam.bench.experiments.pairs import Trial
 from segslam.core.config import Config
-from segslam.core.types import Description, Label, Points, Registration
+from segslam.core.types import Description, Label, Registration
 from segslam.registration import refinement, segregator
-from segslam.registration.free_space import observe_free_space
-from segslam.registration.prepared import prepare_scan
+from segslam.registration.prepared import prepare_observed, prepare_scan
 from segslam.verification import register
 from segslam.verification.patches import agreement
 from tools.benchmarks.common import Row
@@ -42,31 +41,20 @@ def stages(pairs: Iterable[tuple[Trial, Callable[[int], Labelled]]], config: Con
 
 
 def _timed_stages(source: Labelled, target: Labelled, config: Config) -> Iterable[tuple[str, Seconds]]:
-    for points, labels in (source, target):
-        yield "describe", timed(partial(segregator.describe, points, labels, config=config.segregator))
-        yield "surface and view", timed(partial(_surface_and_view, points, config))
+    for scan in (source, target):
+        yield "describe", timed(partial(segregator.describe, *scan, config=config.segregator))
+        yield "surface and view", timed(partial(prepare_observed, *scan, config=config))
     one, other = (prepare_scan(*scan, config=config) for scan in (source, target))
     yield "match", timed(lambda: segregator.match(one.description, other.description, config=config.segregator))
     coarse = segregator.match(one.description, other.description, config=config.segregator)
     if isinstance(coarse, Registration):
-        T_target_source = coarse.T_target_source
-        yield (
-            "refine",
-            timed(lambda: refinement.refine(one.surface, other.surface, T_target_source, config=config.refine)),
-        )
-        yield "verify", timed(lambda: agreement(one, other, T_target_source))
-    yield "cold pair", timed(lambda: _cold(source, target, config))
+        T_coarse = coarse.T_target_source
+        surfaces = one.surface, other.surface
+        yield "refine", timed(lambda: refinement.refine(*surfaces, T_coarse, config=config.refine))
+        yield "verify", timed(lambda: agreement(one, other, T_coarse))
+    clouds, labels = (source[0], target[0]), {"source_labels": source[1], "target_labels": target[1]}
+    yield "cold pair", timed(lambda: register(*clouds, **labels, config=config))
     yield BESIDE, timed(lambda: align_gicp(*(prepare_gicp(points) for points, _ in (source, target))))
-
-
-def _surface_and_view(points: Points, config: Config) -> None:
-    refinement.make_surface(refinement.downsample(points, config=config.refine), config=config.refine)
-    observe_free_space(points)
-
-
-def _cold(source: Labelled, target: Labelled, config: Config) -> None:
-    (source_points, source_labels), (target_points, target_labels) = source, target
-    register(source_points, target_points, source_labels=source_labels, target_labels=target_labels, config=config)
 
 
 def timed(work: Callable[[], object]) -> Seconds:

@@ -11,14 +11,16 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from scipy.special import expit
 
 from segslam.core.config import Config, load_config
 from segslam.verification.patches import BINS
 from segslam.verification.score import Table
 from tools.benchmarks import common, score
 from tools.benchmarks.scene_models import SCENES
+from tools.benchmarks.scenes import Task, tasks
 from tools.benchmarks.score import ratio
-from tools.benchmarks.score.pairs import Task, described, of_drive, of_scene, of_towns
+from tools.benchmarks.score.pairs import described, of_drive, of_towns
 from tools.benchmarks.score.ratio import Best, Pair
 
 DRIVES = ("kitti_whole", "nclt", "courtyard", "town")
@@ -61,7 +63,7 @@ def _describe(options: Namespace) -> None:
 def _tasks(options: Namespace, config: Config) -> Iterator[Task]:
     parts = options.parts.split(",")
     noises = [float(noise) for noise in options.noise.split(",")]
-    drawn = partial(of_scene, count=options.pairs, seed=options.seed, config=config)
+    drawn = partial(tasks, count=options.pairs, seed=options.seed, config=config)
     for turn, sensor in enumerate(options.sensors.split(",")):
         for number, name in enumerate(part for part in parts if part in SCENES):
             yield from drawn(name, sensor, noises[(turn + number) % len(noises)])
@@ -92,8 +94,7 @@ def _learn(options: Namespace) -> None:
 
 def _shipped(pairs: Sequence[Pair]) -> Table:
     table = ratio.calibrated(ratio.learnt(pairs), ratio.calibration(pairs, ratio.left_out(pairs)))
-    scored = [(best, ratio.odds_of(best, table)) for best in ratio.bests(pairs, table)]
-    return replace(table, margin=ratio.margin(pairs, scored, SHARE))
+    return replace(table, margin=ratio.margin(pairs, ratio.bests(pairs, table), SHARE))
 
 
 def _test(options: Namespace) -> None:
@@ -101,13 +102,13 @@ def _test(options: Namespace) -> None:
     taught = tested if options.learnt is None else _read(options.learnt)
     scored: list[tuple[Best, float]] = []
     accepted: list[Best] = []
-    for part in sorted({pair.part for pair in tested}):
-        table = _shipped([pair for pair in taught if pair.part != part])
-        bests = ratio.bests([pair for pair in tested if pair.part == part], table)
-        scored += [(best, ratio.odds_of(best, table)) for best in bests]
-        accepted += [best for best in bests if ratio.odds_of(best, table) >= table.least_odds(Config().verify)]
-    parts = [_row(part, tested, accepted) for part in sorted({pair.part for pair in tested})]
-    figures = {"parts": [*parts, _row("", tested, accepted)], "curve": curve(scored), "tenths": tenths(scored)}
+    for own, others in ratio.by_part(tested, taught):
+        table = _shipped(others)
+        bests = ratio.bests(own, table)
+        scored += bests
+        accepted += [best for best, odds in bests if odds >= table.least_odds(Config().verify)]
+    parts = [_row(part, tested, accepted) for part in (*sorted({pair.part for pair in tested}), "")]
+    figures = {"parts": parts, "curve": curve(scored), "tenths": tenths(scored)}
     for name, rows in figures.items():
         print(common.markdown(name, rows))
     common.write_report(options.out, figures)
@@ -153,7 +154,7 @@ def curve(scored: Sequence[tuple[Best, float]]) -> list[common.Row]:
 
 def tenths(scored: Sequence[tuple[Best, float]]) -> list[common.Row]:
     """Poses by probability, at even prior odds: its mean and the share of right ones; both classes weigh the same."""
-    probability = 1.0 / (1.0 + np.exp(-np.clip([odds for _, odds in scored], -500.0, 500.0)))
+    probability = expit([odds for _, odds in scored])
     is_right = np.array([best.pose.is_right for best, _ in scored])
     weight = np.where(is_right, 0.5 / max(is_right.sum(), 1), 0.5 / max((~is_right).sum(), 1))
     rows: list[common.Row] = []

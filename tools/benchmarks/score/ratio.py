@@ -5,7 +5,7 @@ poses, so the prior odds are even.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -119,9 +119,10 @@ def best_of(pair: Pair, table: Table) -> Best | None:
     return Best(pair, best, ratios[first], min([*leads, NO_OTHER]))
 
 
-def bests(pairs: Sequence[Pair], table: Table) -> list[Best]:
-    """Those of all pairs that have one."""
-    return [best for pair in pairs for best in [best_of(pair, table)] if best is not None]
+def bests(pairs: Sequence[Pair], table: Table) -> list[tuple[Best, float]]:
+    """Those of all pairs that have one, with their log odds."""
+    found = (best_of(pair, table) for pair in pairs)
+    return [(best, odds_of(best, table)) for best in found if best is not None]
 
 
 def learnt(pairs: Sequence[Pair]) -> Table:
@@ -131,7 +132,7 @@ def learnt(pairs: Sequence[Pair]) -> Table:
     the same.
     """
     blank = Table(log_ratios(pairs), Weights._make([0.0] * len(Weights._fields)))
-    found = bests(pairs, blank)
+    found = [best for pair in pairs if (best := best_of(pair, blank)) is not None]
     is_right = np.array([best.pose.is_right for best in found])
     values = np.array([ingredients(best) for best in found])
     mean, scale = values.mean(axis=0), values.std(axis=0) + 1e-9
@@ -175,10 +176,15 @@ def ingredients(best: Best) -> Vector:
 def left_out(pairs: Sequence[Pair]) -> list[tuple[Best, float]]:
     """Best poses and their log odds by what all other parts teach."""
     found: list[tuple[Best, float]] = []
-    for part in sorted({pair.part for pair in pairs}):
-        table = learnt([pair for pair in pairs if pair.part != part])
-        found += [(best, odds_of(best, table)) for best in bests([pair for pair in pairs if pair.part == part], table)]
+    for own, others in by_part(pairs, pairs):
+        found += bests(own, learnt(others))
     return found
+
+
+def by_part(pairs: Sequence[Pair], taught: Sequence[Pair]) -> Iterator[tuple[list[Pair], list[Pair]]]:
+    """The pairs of each part, and those of all other parts in `taught`."""
+    for part in sorted({pair.part for pair in pairs}):
+        yield [pair for pair in pairs if pair.part == part], [pair for pair in taught if pair.part != part]
 
 
 def odds_of(best: Best, table: Table) -> float:

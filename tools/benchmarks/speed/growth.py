@@ -3,6 +3,7 @@
 import resource
 import tempfile
 import time
+import timeit
 from collections.abc import Callable
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 
 from segslam.candidates.proximity import ProximityDetector
 from segslam.core import geometry
-from segslam.core.config import Config
+from segslam.core.config import Config, load_config
 from segslam.core.threads import Stopwatch
 from segslam.core.types import (
     Alignment,
@@ -42,22 +43,22 @@ ROUNDS = 4
 """Rounds of one block before the drive moves to the next."""
 AWAY = 100
 """Keyframes from a block to the next."""
-SIGMA_RAD, SIGMA_M = 0.002, 0.02
+SIGMAS = geometry.tangent(rotation_rad=0.002, translation_m=0.02)
+INFORMATION = np.diag(SIGMAS**-2.0)
 
 
-def graph(num_poses: int, num_closures: int, *, false_share: float, seed: int = 0) -> G2oGraph:
+def graph(num_poses: int, num_closures: int, *, false_share: float) -> G2oGraph:
     """Rounds of one circle, each a little higher, with drifting odometry; some closures are false."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     true = _rounds(num_poses)
-    information = np.diag(geometry.tangent(rotation_rad=SIGMA_RAD, translation_m=SIGMA_M) ** -2.0)
-    edges = [_edge(rng, true, i, i + 1, information) for i in range(num_poses - 1)]
+    edges = [_edge(rng, true, i, i + 1) for i in range(num_poses - 1)]
     poses = {0: true[0]}
     for edge in edges:
         poses[edge.b] = poses[edge.a] @ edge.T_a_b
     sources = np.sort(rng.choice(np.arange(LAP, num_poses), num_closures, replace=num_closures > num_poses - LAP))
     lies = rng.random(num_closures) < false_share
     for source, lie in zip(sources.tolist(), lies.tolist(), strict=True):
-        edges.append(_edge(rng, true, source - LAP, source, information, lie=lie))
+        edges.append(_edge(rng, true, source - LAP, source, lie=lie))
     return G2oGraph(poses, edges)
 
 
@@ -78,22 +79,21 @@ def optimisation(num_poses: int, num_closures: int, *, false_share: float) -> di
     }
 
 
-class Drive(Slam):
+def _pipeline(true: np.ndarray) -> Slam:
     """A pipeline whose loops are true poses with noise: no scans are registered."""
+    config = load_config(None, ["retrieval.enabled=false", "adjustment.max_minutes=0"])
+    no_scans = Trajectory(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 4, 4)))
+    slam, rng = Slam(config, odometry=GivenOdometry(no_scans, config.odometry)), np.random.default_rng(0)
 
-    def __init__(self, T_world_true: np.ndarray) -> None:
-        config = Config()
-        super().__init__(config, odometry=GivenOdometry(_no_scans(), config.odometry))
-        self._true = T_world_true
-        self._rng = np.random.default_rng(0)
-        self._information = np.diag(geometry.tangent(rotation_rad=SIGMA_RAD, translation_m=SIGMA_M) ** -2.0)
-
-    def _attempt(self, candidate: LoopCandidate, watch: Stopwatch) -> LoopAttempt:
-        edge = _edge(self._rng, self._true, candidate.target_id, candidate.source_id, self._information)
-        found = Registration(edge.T_a_b, 30, 30, 0.05, self._information)
+    def attempts(candidate: LoopCandidate, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
+        edge = _edge(rng, true, candidate.target_id, candidate.source_id)
+        found = Registration(edge.T_a_b, 30, 30, 0.05, INFORMATION)
         alignment = Alignment(found, found, 0.8, 0.05, 0.0)
         ids = candidate.source_id, candidate.target_id
-        return LoopAttempt(candidate, LoopClosure(*ids, edge.T_a_b, self._information, alignment), {})
+        return (LoopAttempt(candidate, LoopClosure(*ids, edge.T_a_b, INFORMATION, alignment), {}),)
+
+    slam._loops._attempts = attempts  # type: ignore[method-assign]
+    return slam
 
 
 def drive(num_keyframes: int) -> dict[str, float]:
@@ -105,7 +105,7 @@ def drive(num_keyframes: int) -> dict[str, float]:
     ) * np.sqrt(STEP_M)
     rng = np.random.default_rng(1)
     motions = [geometry.inverse(a) @ b @ geometry.exp(rng.normal(size=6) * sigmas) for a, b in pairwise(true)]
-    slam, num_closures = Drive(true), 0
+    slam, num_closures = _pipeline(true), 0
     with tempfile.TemporaryDirectory() as folder, LogWriter(Path(folder) / "log.mcap", config=slam.config) as log:
         slam.keep_clouds_in(log)
         started = time.perf_counter()
@@ -114,7 +114,7 @@ def drive(num_keyframes: int) -> dict[str, float]:
             keyframe = Keyframe(i, i, i * 10**8, T_odom_lidar, STEP_M * i, points, labels)
             step = slam.repeat(Step(i, i * 10**8, T_odom_lidar, keyframe, (), None, {}))
             log.write(step)
-            num_closures += len(step.attempts)
+            num_closures += sum(isinstance(attempt.outcome, LoopClosure) for attempt in step.attempts)
         driven_s = time.perf_counter() - started
         result = slam.finish()
         log.write_result(result.estimate, result.trajectory)
@@ -129,25 +129,20 @@ def drive(num_keyframes: int) -> dict[str, float]:
     }
 
 
-def drives(sizes: tuple[int, ...]) -> dict[str, Any]:
-    """`drive` by number of keyframes, and the exponent of its time."""
-    rows = [drive(size) for size in sizes]
-    return {"size": list(sizes), "exponent": exponent(sizes, [row["seconds"] for row in rows])} | {
-        name: [row[name] for row in rows] for name in rows[0]
-    }
-
-
-def curves(sizes: tuple[int, ...]) -> dict[str, Any]:
+def curves(sizes: tuple[int, ...], drive_sizes: tuple[int, ...]) -> dict[str, Any]:
     """Seconds by size, and the exponent of the power law through the larger half of them."""
-    measured = {
-        "optimise_graph": [optimisation(n, n // 5, false_share=0.2)["seconds"] for n in sizes],
-        "propose_loops": [_propose_seconds(n) for n in sizes],
-        "draw_path": [_draw_seconds(n) for n in sizes],
+    measured: dict[str, tuple[tuple[int, ...], Callable[[int], dict[str, Any]]]] = {
+        "optimise_graph": (sizes, lambda n: {"seconds": optimisation(n, n // 5, false_share=0.2)["seconds"]}),
+        "propose_loops": (sizes, lambda n: {"seconds": _propose_seconds(n)}),
+        "draw_path": (sizes, lambda n: {"seconds": _draw_seconds(n)}),
+        "drive": (drive_sizes, drive),
     }
-    return {
-        name: {"size": list(sizes), "seconds": seconds, "exponent": exponent(sizes, seconds)}
-        for name, seconds in measured.items()
-    }
+    found = {}
+    for name, (numbers, measure) in measured.items():
+        rows = [measure(number) for number in numbers]
+        found[name] = {"size": list(numbers), "exponent": exponent(numbers, [row["seconds"] for row in rows])}
+        found[name] |= {key: [row[key] for row in rows] for key in rows[0]}
+    return found
 
 
 def exponent(sizes: tuple[int, ...], seconds: list[float]) -> float:
@@ -160,7 +155,7 @@ def _propose_seconds(num_keyframes: int) -> float:
     detector, poses = ProximityDetector(Config().proximity), _rounds(num_keyframes)
     pairs = [(source, source - LAP) for source in range(LAP, num_keyframes, 5)]
     for pair in pairs:
-        detector.note_closure(_closure(*pair))
+        detector.note_closure(LoopClosure(*pair, np.eye(4), np.eye(6), alignment=None))  # type: ignore[arg-type]
     detector.note_estimate({})
     travel_m = STEP_M * np.arange(num_keyframes)
     motions = [
@@ -169,7 +164,9 @@ def _propose_seconds(num_keyframes: int) -> float:
     ]
     closures = [Edge(a, b, np.eye(4), closure_information(np.eye(6))) for b, a in pairs]
     chains = Chains(poses, motions, closures)
-    return _timed(lambda: detector.candidates(num_keyframes - 1, poses, travel_m, chains.covariances))
+    return min(
+        timeit.repeat(lambda: detector.candidates(num_keyframes - 1, poses, travel_m, chains.covariances), number=1)
+    )
 
 
 def _draw_seconds(num_keyframes: int) -> float:
@@ -177,16 +174,7 @@ def _draw_seconds(num_keyframes: int) -> float:
     poses = dict(enumerate(_rounds(num_keyframes)))
     drawing._T_odom_keyframe = poses
     estimate = GraphEstimate(poses, 0.0, {})
-    return _timed(lambda: list(drawing.draw_estimate(estimate, stamp_ns=0)))
-
-
-def _timed(work: Callable[[], object]) -> float:
-    times = []
-    for _ in range(5):
-        started = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - started)
-    return min(times)
+    return min(timeit.repeat(lambda: list(drawing.draw_estimate(estimate, stamp_ns=0)), number=1))
 
 
 def _town(num_poses: int) -> np.ndarray:
@@ -197,31 +185,19 @@ def _town(num_poses: int) -> np.ndarray:
     return np.array(list(accumulate(steps, np.matmul, initial=np.eye(4))))
 
 
-def _no_scans() -> Trajectory:
-    return Trajectory(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 4, 4)))
-
-
 def _rounds(num_poses: int) -> np.ndarray:
+    """Rounds of one circle, each a little higher."""
     turn = 2.0 * np.pi / LAP
     radius_m = STEP_M / turn
-    return np.stack(
-        [
-            geometry.transform(
-                geometry.yaw(turn * i), [radius_m * np.sin(turn * i), -radius_m * np.cos(turn * i), 1e-4 * i]
-            )
-            for i in range(num_poses)
-        ]
-    )
+    poses = np.tile(np.eye(4), (num_poses, 1, 1))
+    for i, pose in enumerate(poses):
+        pose[:3, :3] = geometry.yaw(turn * i)
+        pose[:3, 3] = radius_m * np.sin(turn * i), -radius_m * np.cos(turn * i), 1e-4 * i
+    return poses
 
 
-def _edge(
-    rng: np.random.Generator, true: np.ndarray, a: int, b: int, information: np.ndarray, *, lie: bool = False
-) -> Edge:
-    noise = rng.normal(size=6) * geometry.tangent(rotation_rad=SIGMA_RAD, translation_m=SIGMA_M)
+def _edge(rng: np.random.Generator, true: np.ndarray, a: int, b: int, *, lie: bool = False) -> Edge:
+    noise = rng.normal(size=6) * SIGMAS
     if lie:
         noise = rng.normal(size=6) * geometry.tangent(rotation_rad=0.3, translation_m=5.0)
-    return Edge(a, b, geometry.inverse(true[a]) @ true[b] @ geometry.exp(noise), information)
-
-
-def _closure(source_id: int, target_id: int) -> LoopClosure:
-    return LoopClosure(source_id, target_id, np.eye(4), np.eye(6), alignment=None)  # type: ignore[arg-type]
+    return Edge(a, b, geometry.inverse(true[a]) @ true[b] @ geometry.exp(noise), INFORMATION)

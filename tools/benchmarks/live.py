@@ -14,43 +14,95 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from itertools import chain, cycle, islice
+from array import array
+from collections import deque
+from itertools import cycle, islice
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
 import numpy as np
 
-from segslam.core import geometry
+from segslam.core.evaluation import pose_errors
+from segslam.core.memory import status_mb
+from segslam.core.trajectory import rows_of_same_stamp
 from segslam.output.finished import read_run
 from segslam.output.log import read_log
 from segslam.scans import Dataset, open_dataset
 from tools.benchmarks import common
-from tools.benchmarks.live.sender import FolderSender, RosSender, Sender
+from tools.benchmarks.faults.files import write_whole
 
 TOPIC = "/segslam_bench/points"
 SAMPLE_S = 5.0
 OWN_DOMAIN = {"ROS_DOMAIN_ID": "87", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOCALHOST_ONLY": "1"}
 
 
-def rows_sent(num_scans: int, num_sent: int | None) -> Iterator[int]:
-    """Each scan once, or forwards and backwards until `num_sent` are sent."""
-    if num_sent is None:
-        return iter(range(num_scans))
-    return islice(cycle(chain(range(num_scans), range(num_scans - 2, 0, -1))), num_sent)
+class FolderSender:
+    """Writes .bin files named by their stamp in ns, and the times.txt that an offline run of the folder needs."""
+
+    def __init__(self, folder: Path, *, keeps: int | None = None) -> None:
+        """Only the last `keeps` files are kept, unless it is None."""
+        folder.mkdir()
+        self._folder = folder
+        self._keeps = keeps
+        self._files: deque[Path] = deque()
+
+    def wait_for_listener(self) -> None:
+        """No receiver to wait for."""
+
+    def send(self, points: np.ndarray, stamp_ns: int) -> None:
+        """Write a scan."""
+        rows = np.column_stack([points, np.linalg.norm(points, axis=1)])
+        self._files.append(write_whole(self._folder, rows, f"{stamp_ns:019d}.bin"))
+        if self._keeps is not None and len(self._files) > self._keeps:
+            self._files.popleft().unlink()
+        with (self._folder / "times.txt").open("a") as stream:
+            stream.write(f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}\n")
+
+
+class RosSender:
+    """Publishes PointCloud2 messages of 16 bytes a point, stamped when they are sent."""
+
+    def __init__(self, reliability: str) -> None:
+        import rclpy
+        from rclpy.qos import QoSProfile, ReliabilityPolicy
+        from sensor_msgs.msg import PointCloud2, PointField
+
+        rclpy.init()
+        self._node = rclpy.create_node("bench")
+        profile = QoSProfile(depth=5, reliability=ReliabilityPolicy[reliability.upper()])
+        self._publisher = self._node.create_publisher(PointCloud2, TOPIC, profile)
+        self._message = PointCloud2(height=1, point_step=16)
+        self._message.header.frame_id = "lidar"
+        self._message.fields = [
+            PointField(name=axis, offset=4 * k, datatype=PointField.FLOAT32, count=1) for k, axis in enumerate("xyz")
+        ]
+
+    def wait_for_listener(self) -> None:
+        """Until segslam has subscribed."""
+        while self._publisher.get_subscription_count() == 0:
+            sleep(0.05)
+        sleep(0.5)
+
+    def send(self, points: np.ndarray, stamp_ns: int) -> None:
+        """Publish a scan."""
+        rows = np.zeros((len(points), 4), "<f4")
+        rows[:, :3] = points
+        message = self._message
+        message.width, message.row_step, message.data = len(rows), rows.nbytes, array("B", rows.tobytes())
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
 
 
 def rss_mb(pid: int) -> float:
     """Memory of a process and of all that it has started."""
-    total = 0.0
-    status = Path(f"/proc/{pid}/status").read_text()
-    total += next((int(line.split()[1]) for line in status.splitlines() if line.startswith("VmRSS")), 0) / 1024
     children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    return total + sum(rss_mb(int(child)) for child in children)
+    return (status_mb("VmRSS", pid) or 0.0) + sum(rss_mb(int(child)) for child in children)
 
 
-def run_live(dataset: Dataset, sender: Sender, words: list[str], every_s: float, seconds: float | None) -> Any:
+def run_live(
+    dataset: Dataset, sender: FolderSender | RosSender, words: list[str], every_s: float, seconds: float | None
+) -> Any:
     """Exit status, figures, (seconds, MB) of the memory, and how many scans were sent."""
     command = [sys.executable, "-m", "segslam", "live", *words, "--json"]
     live = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -61,7 +113,10 @@ def run_live(dataset: Dataset, sender: Sender, words: list[str], every_s: float,
     sender.wait_for_listener()
     num_sent, memory, started = 0, [], monotonic()
     next_s, next_sample = started, started
-    for row in rows_sent(len(dataset), None if seconds is None else int(seconds / every_s)):
+    rows = list(range(len(dataset)))
+    if seconds is not None:  # forwards and backwards
+        rows = list(islice(cycle(rows + rows[-2:0:-1]), int(seconds / every_s)))
+    for row in rows:
         scan = dataset[row]
         sleep(max(0.0, next_s - monotonic()))
         stamp_ns = scan.stamp_ns if seconds is None else int(num_sent * every_s * 1e9)
@@ -82,19 +137,14 @@ def compared(live: Path, offline: Path) -> dict[str, Any]:
     """The two runs: closures that only one has, and the largest distance between poses of the same stamp."""
     closures = [closures_by_stamp(folder) for folder in (live, offline)]
     here, there = (read_run(folder).result.trajectory for folder in (live, offline))
-    of_stamp = {int(stamp): T for stamp, T in zip(there.stamp_ns, there.T_world_lidar, strict=True)}
-    pairs = [
-        (T, of_stamp[int(stamp)])
-        for stamp, T in zip(here.stamp_ns, here.T_world_lidar, strict=True)
-        if int(stamp) in of_stamp
-    ]
-    apart = [geometry.distance(geometry.inverse(one) @ other) for one, other in pairs]
+    rows = rows_of_same_stamp(here.stamp_ns, there.stamp_ns, max_difference_ns=0)
+    apart_m = pose_errors(here.T_world_lidar[rows[:, 0]], there.T_world_lidar[rows[:, 1]]).translation_m
     return {
         "num_closures": [len(found) for found in closures],
         "num_only_live": len(closures[0] - closures[1]),
         "num_only_offline": len(closures[1] - closures[0]),
-        "num_poses_compared": len(apart),
-        "largest_apart_m": max(apart),
+        "num_poses_compared": len(rows),
+        "largest_apart_m": float(apart_m.max()),
     }
 
 
@@ -127,9 +177,9 @@ def main() -> None:
     chosen.out.mkdir(parents=True)
     settings = [word for setting in chosen.set for word in ("--set", setting)]
     dataset = open_dataset(chosen.data, frames=chosen.frames, labels="none", vertical_angle_deg=0.0)
-    sender: Sender
+    sender: FolderSender | RosSender
     if chosen.ros:
-        sender, source = RosSender(TOPIC, chosen.ros), ["--topic", TOPIC]
+        sender, source = RosSender(chosen.ros), ["--topic", TOPIC]
     else:
         scans = chosen.out / "scans"
         sender, source = FolderSender(scans, keeps=100 if chosen.seconds else None), [str(scans)]
@@ -142,11 +192,7 @@ def main() -> None:
         "every_s": chosen.every,
         "num_sent": num_sent,
         **{key: metrics[key] for key in metrics if key.startswith(("num_", "latency", "loop_lag", "longest"))},
-        "process_without_odometry_ms": {
-            "median": float(np.median(process_ms)),
-            "p95": float(np.percentile(process_ms, 95)),
-            "max": max(process_ms),
-        },
+        "process_without_odometry_ms": common.spread(process_ms),
         "odometry_ms": metrics["stage_ms"]["odometry"],
         "odometry_ms_by_fifths": by_fifths([1000 * step.stage_seconds["odometry"] for step in steps]),
         "rss_mb_by_fifths": by_fifths([mb for _, mb in memory]),

@@ -11,7 +11,6 @@ import typer
 
 from segslam.bench.experiments.method_settings import METHOD_NAMES
 from segslam.cli.checks import check_free, check_own
-from segslam.cli.completion import one_of
 from segslam.cli.console import Terminal
 from segslam.cli.ending import is_interrupted
 from segslam.cli.options import (
@@ -71,7 +70,7 @@ class Options:
         list[str] | None,
         typer.Option(
             "--method",
-            autocompletion=one_of(*METHOD_NAMES),
+            autocompletion=lambda: METHOD_NAMES,
             help=f"Method, may be repeated; default: all of {', '.join(METHOD_NAMES)}.",
         ),
     ] = None

@@ -11,7 +11,7 @@ from typer.core import TyperCommand
 
 from segslam.bench.experiments.method_settings import METHOD_NAMES, check_method
 from segslam.cli.checks import check_exists
-from segslam.cli.completion import labels_or_files, one_of
+from segslam.cli.completion import labels_or_files
 from segslam.cli.console import Terminal, print_json, print_out, say
 from segslam.cli.options import EncodingOption, Settings
 from segslam.core.errors import SegslamError
@@ -45,7 +45,7 @@ class ScanFileOptions:
 
     dataset: Annotated[
         str | None,
-        typer.Option(autocompletion=one_of("kitti"), help="kitti: apply KITTI's correction of the vertical angles."),
+        typer.Option(autocompletion=lambda: ["kitti"], help="kitti: apply KITTI's correction of the vertical angles."),
     ] = None
     encoding: EncodingOption = None
 
@@ -145,7 +145,7 @@ def register(
     ] = None,
     files: ScanFileOptions,
     method: Annotated[
-        str, typer.Option(autocompletion=one_of(*METHOD_NAMES), help=f"Method: {', '.join(METHOD_NAMES)}.")
+        str, typer.Option(autocompletion=lambda: METHOD_NAMES, help=f"Method: {', '.join(METHOD_NAMES)}.")
     ] = "segregator-c2f",
     refine: Annotated[
         bool, typer.Option("--refine/--no-refine", help="Refine the coarse pose with GICP (method segregator-c2f).")

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from segslam.cli.checks import check_own, make_room
-from segslam.cli.completion import SENSORS, one_of, simulation_settings
+from segslam.cli.completion import simulation_settings
 from segslam.cli.console import Terminal, how_to_go_on
 from segslam.cli.map import map_scans
 from segslam.cli.options import OverwriteOption
@@ -37,7 +37,10 @@ def simulate(
     frames: Annotated[int | None, typer.Option(min=1, help="Number of scans; default: the whole drive.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed; the same seed gives the same scans.")] = 0,
     sensor: Annotated[
-        str, typer.Option(autocompletion=one_of(*SENSORS), help="Sensor: hdl64 (as in KITTI), os1-64 or vlp16.")
+        str,
+        typer.Option(
+            autocompletion=lambda: ("hdl64", "os1-64", "vlp16"), help="Sensor: hdl64 (as in KITTI), os1-64 or vlp16."
+        ),
     ] = "hdl64",
     lane: Annotated[
         float, typer.Option(min=-4, max=4, help="Offset to the left of the path (m); negative: to the right.")

@@ -49,27 +49,19 @@ class Options:
 
     pairs: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--pairs", help="List of pairs: one `source target` per line, or JSON with their poses; may be repeated."
-        ),
+        typer.Option(help="List of pairs: one `source target` per line, or JSON with their poses; may be repeated."),
     ] = None
     min_m: Annotated[
-        float | None,
-        typer.Option("--min-m", min=0, help="Make a list from the true poses: smallest distance of a pair (m)."),
+        float | None, typer.Option(min=0, help="Make a list from the true poses: smallest distance of a pair (m).")
     ] = None
-    max_m: Annotated[float | None, typer.Option("--max-m", min=0, help="Largest distance of such a pair (m).")] = None
-    min_gap: Annotated[
-        int, typer.Option("--min-gap", min=1, help="Smallest number of scans between the two of such a pair.")
-    ] = 50
-    sample: Annotated[
-        int | None, typer.Option("--sample", min=1, help="Use only N pairs of each list, drawn at random.")
-    ] = None
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed of --sample.")] = 0
+    max_m: Annotated[float | None, typer.Option(min=0, help="Largest distance of such a pair (m).")] = None
+    min_gap: Annotated[int, typer.Option(min=1, help="Smallest number of scans between the two of such a pair.")] = 50
+    sample: Annotated[int | None, typer.Option(min=1, help="Use only N pairs of each list, drawn at random.")] = None
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of --sample.")] = 0
     sequence: SequenceOption = "00"
     method: Annotated[
         list[str] | None,
         typer.Option(
-            "--method",
             autocompletion=lambda: METHOD_NAMES,
             help=f"Method, may be repeated; default: all of {', '.join(METHOD_NAMES)}.",
         ),
@@ -77,23 +69,18 @@ class Options:
     dataset: DatasetOption = None
     labels: LabelsOption = "auto"
     encoding: EncodingOption = None
-    workers: Annotated[
-        int, typer.Option("--workers", min=1, help="Number of processes on this machine (extra `cluster`).")
-    ] = 1
+    workers: Annotated[int, typer.Option(min=1, help="Number of processes on this machine (extra `cluster`).")] = 1
     scheduler: Annotated[
-        str | None, typer.Option("--scheduler", help="Address of a Dask cluster with access to DATA (extra `cluster`).")
+        str | None, typer.Option(help="Address of a Dask cluster with access to DATA (extra `cluster`).")
     ] = None
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out",
-            help="Folder for the report and the rows; the same command continues an interrupted benchmark there.",
+            help="Folder for the report and the rows; the same command continues an interrupted benchmark there."
         ),
     ] = None
-    details: Annotated[Path | None, typer.Option("--details", help="CSV file to write, one row per registration.")] = (
-        None
-    )
-    draw: Annotated[int, typer.Option("--draw", min=0, help="Draw the N worst failures; needs --out.")] = 0
+    details: Annotated[Path | None, typer.Option(help="CSV file to write, one row per registration.")] = None
+    draw: Annotated[int, typer.Option(min=0, help="Draw the N worst failures; needs --out.")] = 0
     overwrite: OverwriteOption = False
 
 
@@ -124,9 +111,7 @@ def yaw(
     *,
     options: Options,
     changes: Settings,
-    step_deg: Annotated[
-        float, typer.Option("--step-deg", min=1, max=180, help="Step between two yaw angles (degrees).")
-    ] = 15.0,
+    step_deg: Annotated[float, typer.Option(min=1, max=180, help="Step between two yaw angles (degrees).")] = 15.0,
     terminal: Terminal,
 ) -> None:
     """Measure the error against the yaw of the source, over the full circle. Default pair: scans 0 and 10.
@@ -150,7 +135,7 @@ def deterioration(
     clouds: Annotated[
         Literal["one", "both"], typer.Option(help="Remove labels from the source only, or from both scans.")
     ] = "both",
-    draws: Annotated[int, typer.Option("--draws", min=1, help="Number of random draws at each percentage.")] = 10,
+    draws: Annotated[int, typer.Option(min=1, help="Number of random draws at each percentage.")] = 10,
     terminal: Terminal,
 ) -> None:
     """Measure the success while labels are removed at random. Default pair: scans 0 and 10.
@@ -169,10 +154,10 @@ def places(
         Path, typer.Argument(help="Places: a .npz with `columns` (n, size, size) uint8 and `poses` (n, 3, 4).")
     ],
     *,
-    database: Annotated[str, typer.Option("--database", help="Rows of the database: A:B, B excluded.")],
-    queries: Annotated[str, typer.Option("--queries", help="Rows of the queries: C:D.")],
-    turned: Annotated[bool, typer.Option("--turned", help="Rotate each query by a random yaw.")] = False,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed of --turned.")] = 0,
+    database: Annotated[str, typer.Option(help="Rows of the database: A:B, B excluded.")],
+    queries: Annotated[str, typer.Option(help="Rows of the queries: C:D.")],
+    turned: Annotated[bool, typer.Option(help="Rotate each query by a random yaw.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of --turned.")] = 0,
     terminal: Terminal,
 ) -> None:
     """Measure how often a place is recognised, without labels. A hit is within 5 m; queries without one are omitted.

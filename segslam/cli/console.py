@@ -55,8 +55,7 @@ class Terminal:
     """Options of nearly every command, and how it answers: results on standard output, all else on standard error."""
 
     json: Annotated[
-        bool,
-        typer.Option("--json", help="Print the figures as one JSON object on standard output, and nothing else there."),
+        bool, typer.Option(help="Print the figures as one JSON object on standard output, and nothing else there.")
     ] = False
     quiet: Annotated[
         bool,

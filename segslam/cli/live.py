@@ -57,7 +57,7 @@ def live(
     idle: Annotated[
         float | None, typer.Option(min=0.1, metavar="SECONDS", help="End after this time without a new scan.")
     ] = None,
-    labels: Annotated[str, typer.Option("--labels", help="Labels: geometric (auto is the same) or none.")] = "auto",
+    labels: Annotated[str, typer.Option(help="Labels: geometric (auto is the same) or none.")] = "auto",
     preset: PresetOption = "auto",
     output: RunOutput,
     gnss: GnssOptions,

@@ -34,8 +34,7 @@ class _ListTerminal(Terminal):
     """As `Terminal`; the figures are those of several scans."""
 
     json: Annotated[
-        bool,
-        typer.Option("--json", help="Print a JSON list with one object per scan on standard output, and nothing else."),
+        bool, typer.Option(help="Print a JSON list with one object per scan on standard output, and nothing else.")
     ] = False
 
 

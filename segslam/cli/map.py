@@ -50,8 +50,7 @@ def map_command(
     output: RunOutput,
     gnss: GnssOptions,
     dry_run: Annotated[
-        bool,
-        typer.Option("--dry-run", help="Show the content of DATA and the settings; write nothing. Needs no --out."),
+        bool, typer.Option(help="Show the content of DATA and the settings; write nothing. Needs no --out.")
     ] = False,
     terminal: Terminal,
 ) -> None:

@@ -18,10 +18,7 @@ def merge(
     *,
     out: Annotated[Path, typer.Option(help="New folder for the merged run.")],
     same_reference: Annotated[
-        bool,
-        typer.Option(
-            "--same-reference", help="The true poses of all runs are in one frame: score the merged trajectory."
-        ),
+        bool, typer.Option(help="The true poses of all runs are in one frame: score the merged trajectory.")
     ] = False,
     with_map: WithMapOption = False,
     changes: RunSettings,
@@ -78,8 +75,7 @@ def fleet(
         typer.Option(help="Number of processes on this machine, by default one for two cores.", min=1),
     ] = None,
     same_reference: Annotated[
-        bool,
-        typer.Option("--same-reference", help="The true poses of all drives are in one frame: score each component."),
+        bool, typer.Option(help="The true poses of all drives are in one frame: score each component.")
     ] = False,
     changes: Settings,
     terminal: Terminal,

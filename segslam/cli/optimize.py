@@ -29,7 +29,7 @@ def optimize(
         ),
     ] = "consistent",
     overwrite: OverwriteOption = False,
-    force: Annotated[bool, typer.Option("--force", hidden=True, help="The same as --overwrite.")] = False,
+    force: Annotated[bool, typer.Option(hidden=True, help="The same as --overwrite.")] = False,
     terminal: Terminal,
 ) -> None:
     """Optimise a pose graph. Errors are half the chi-square, as in GTSAM, of the edges that were not rejected.

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer.models import OptionInfo
 
 from segslam.cli import completion
 from segslam.core.errors import SegslamError
@@ -30,23 +31,19 @@ LogArgument = Annotated[Path, typer.Argument(help="Run folder, or its log.mcap, 
 DatasetOption = Annotated[
     str | None,
     typer.Option(
-        "--dataset",
-        autocompletion=completion.datasets,
-        help="Kind of data: kitti, or a reader of kiss-icp; detected by default.",
+        autocompletion=completion.datasets, help="Kind of data: kitti, or a reader of kiss-icp; detected by default."
     ),
 ]
 Numbering = Literal["raw", "learning", "learning-0"]
 EncodingOption = Annotated[
     Numbering | None,
     typer.Option(
-        "--encoding",
-        help="Numbering of the label files, if it cannot be detected: raw, learning (0-19), learning-0 (0-18).",
+        help="Numbering of the label files, if it cannot be detected: raw, learning (0-19), learning-0 (0-18)."
     ),
 ]
 FoxgloveOption = Annotated[
     str | None,
     typer.Option(
-        "--foxglove",
         metavar="PORT",
         help="Serve the run live to Foxglove on this port of 127.0.0.1; ADDRESS:PORT for another address.",
     ),
@@ -54,24 +51,20 @@ FoxgloveOption = Annotated[
 LabelsOption = Annotated[
     str,
     typer.Option(
-        "--labels",
         autocompletion=completion.labels_or_files,
         help="Labels: auto (labels/ if present, else geometric), none, geometric, network:MODEL.onnx, or a folder.",
     ),
 ]
-OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="Replace the run or the files that exist under this name.")
-]
+OverwriteOption = Annotated[bool, typer.Option(help="Replace the run or the files that exist under this name.")]
 PresetOption = Annotated[
     str,
     typer.Option(
-        "--preset",
         autocompletion=completion.presets,
         help="Settings for an environment: driving, campus or indoor; auto: by the scans.",
     ),
 ]
-SequenceOption = Annotated[str, typer.Option("--sequence", help="Sequence of the data set.")]
-ViewOption = Annotated[bool, typer.Option("--view", help="Show the run in the Rerun viewer while it is mapped.")]
+SequenceOption = Annotated[str, typer.Option(help="Sequence of the data set.")]
+ViewOption = Annotated[bool, typer.Option(help="Show the run in the Rerun viewer while it is mapped.")]
 WithMapOption = Annotated[
     bool, typer.Option("--map", help="Also write the map: map.ply (cloud) and map.png (top view).")
 ]
@@ -81,9 +74,9 @@ WithMapOption = Annotated[
 class Settings:
     """The settings of a command."""
 
-    config: Annotated[
-        Path | None, typer.Option("--config", help="YAML file with the settings that differ from the defaults.")
-    ] = None
+    config: Annotated[Path | None, typer.Option(help="YAML file with the settings that differ from the defaults.")] = (
+        None
+    )
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -112,7 +105,6 @@ class RunSettings(Settings):
     refine_minutes: Annotated[
         float | None,
         typer.Option(
-            "--refine-minutes",
             metavar="MINUTES",
             help="Time limit of the adjustment of the whole map after the loops; 60 by default, 0: no adjustment.",
         ),
@@ -161,11 +153,10 @@ class ScanOptions:
     dataset: DatasetOption = None
     sequence: SequenceOption = "00"
     frames: Annotated[
-        str | None,
-        typer.Option("--frames", metavar="A:B[:STEP]", help="Use scans A to B by number, B excluded; every STEP-th."),
+        str | None, typer.Option(metavar="A:B[:STEP]", help="Use scans A to B by number, B excluded; every STEP-th.")
     ] = None
     topic: Annotated[
-        str, typer.Option("--topic", help="Point cloud topic, if the recording (rosbag, mcap) has more than one.")
+        str, typer.Option(help="Point cloud topic, if the recording (rosbag, mcap) has more than one.")
     ] = ""
 
     def source(
@@ -193,11 +184,10 @@ class RunOptions(ScanOptions):
     labels: LabelsOption = "auto"
     encoding: EncodingOption = None
     odometry: Annotated[
-        Path | None,
-        typer.Option("--odometry", help="Trajectory to use instead of KISS-ICP (KITTI or TUM format, LiDAR frame)."),
+        Path | None, typer.Option(help="Trajectory to use instead of KISS-ICP (KITTI or TUM format, LiDAR frame).")
     ] = None
     preset: PresetOption = "auto"
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the interrupted run in --out.")] = False
+    resume: Annotated[bool, typer.Option(help="Continue the interrupted run in --out.")] = False
 
 
 @dataclass(frozen=True)
@@ -271,7 +261,10 @@ class GnssOptions:
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with the fields of each parameter that is annotated with a dataclass in place of that parameter."""
+    """The command with the fields of each parameter that is annotated with a dataclass in place of that parameter.
+
+    An option without a name of its own is called like its parameter; a flag has no opposite `--no-...`.
+    """
     own = inspect.signature(command, eval_str=True)
     records: dict[str, type[Any]] = {
         name: one.annotation
@@ -290,6 +283,10 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
         for name, one in own.parameters.items()
         for parameter in (inspect.signature(records[name]).parameters.values() if name in records else [one])
     ]
+    for one in parameters:
+        option = one.annotation.__metadata__[0]
+        if isinstance(option, OptionInfo) and option.default is ...:  # where typer has the first name
+            option.param_decls = (f"--{one.name.replace('_', '-')}",)
     flat.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
     flat.__annotations__ = {one.name: one.annotation for one in parameters}
     return flat

@@ -59,8 +59,7 @@ def edit(
         ),
     ] = None,
     add_near_fixes: Annotated[
-        bool,
-        typer.Option("--add-near-fixes", help="Add keyframes that the fixes of the run place near each other."),
+        bool, typer.Option(help="Add keyframes that the fixes of the run place near each other.")
     ] = False,
     changes: RunSettings,
     overwrite: OverwriteOption = False,

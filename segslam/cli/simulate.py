@@ -45,7 +45,7 @@ def simulate(
     lane: Annotated[
         float, typer.Option(min=-4, max=4, help="Offset to the left of the path (m); negative: to the right.")
     ] = 0.0,
-    reverse: Annotated[bool, typer.Option("--reverse", help="Drive the path in the opposite direction.")] = False,
+    reverse: Annotated[bool, typer.Option(help="Drive the path in the opposite direction.")] = False,
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -56,8 +56,7 @@ def simulate(
         ),
     ] = None,
     pairs: Annotated[
-        list[Path] | None,
-        typer.Option("--pairs", help="Write only the scans in this list of pairs; may be repeated."),
+        list[Path] | None, typer.Option(help="Write only the scans in this list of pairs; may be repeated.")
     ] = None,
     sample: Annotated[
         int | None, typer.Option(min=1, help="Use only N pairs of each list, those of `bench --sample N --seed 0`.")

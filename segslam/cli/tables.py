@@ -47,9 +47,9 @@ def with_meaning(cells: str, meaning: str) -> str:
 class TableFiles:
     """Options of commands with a table."""
 
-    csv: Annotated[Path | None, typer.Option("--csv", help="Write the table to this file, a row for each.")] = None
+    csv: Annotated[Path | None, typer.Option(help="Write the table to this file, a row for each.")] = None
     latex: Annotated[
-        Path | None, typer.Option("--latex", help="Write the table to this file as a LaTeX tabular, a row for each.")
+        Path | None, typer.Option(help="Write the table to this file as a LaTeX tabular, a row for each.")
     ] = None
 
     def write(self, rows: Rows) -> None:

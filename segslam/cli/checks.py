@@ -41,22 +41,23 @@ def check_own(folder: Path, *made_by: str) -> None:
         raise SegslamError(f"{folder}: not empty, and not made by this command; give another folder")
 
 
-def make_room(
+def make_folder(
     folder: Path,
     *,
     overwrite: bool,
     inputs: Iterable[Path | None] = (),
     made_by: tuple[str, ...] = ("log.mcap", "log.mcap.part"),
-) -> None:
-    """Remove an earlier run in the folder of a new one, if `overwrite` is set; otherwise leave all as it is.
+) -> Path:
+    """Create the folder of a new run, as `new_folder`; with `overwrite` an earlier run there is removed before.
 
     Raises SegslamError for a folder that is no run (it has none of the files `made_by`), for a run in progress, and if
     the new run is made from files in it.
     """
+    from segslam.output.folder import new_folder
     from segslam.output.log import is_being_written
 
     if not overwrite or not folder.is_dir() or not any(folder.iterdir()):
-        return
+        return new_folder(folder)
     logs = [folder / name for name in made_by if (folder / name).exists()]
     if not logs or folder.is_symlink():
         raise SegslamError(f"{folder}: not made by this command, so --overwrite does not remove it; give another --out")
@@ -67,6 +68,7 @@ def make_room(
     if any(log.is_file() and is_being_written(log) for log in logs):
         raise SegslamError(f"{folder}: the run is still in progress; stop it, or give another --out")
     shutil.rmtree(folder)
+    return new_folder(folder)
 
 
 def check_links(folder: Path) -> None:

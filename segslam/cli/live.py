@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.checks import check_exists, check_free, live_configs, make_room, show_preset
+from segslam.cli.checks import check_exists, check_free, live_configs, make_folder, show_preset
 from segslam.cli.console import Terminal, how_to_go_on
 from segslam.cli.ending import counted, finish
 from segslam.cli.options import GnssOptions, PresetOption, RunOutput
@@ -78,7 +78,6 @@ def live(
     terminal.announce("live: starting")
     configs = live_configs(preset, output)
     from segslam.labels.label_files import unlabelled
-    from segslam.output.folder import new_folder
     from segslam.run.live.front import Front
     from segslam.run.live.live_map import LiveMap
     from segslam.run.run import Run
@@ -93,8 +92,7 @@ def live(
     with ExitStack() as stack:
         scene = stack.enter_context(scene_in(None)) if output.view else None
         server = serve_foxglove(output.foxglove, stack, terminal)
-        make_room(out, overwrite=output.overwrite, inputs=[folder])
-        out = new_folder(out)
+        make_folder(out, overwrite=output.overwrite, inputs=[folder])
         stack.callback(_remove_if_empty, out)
         terminal.compile_kernels()
         go_on = f"make the results from the log: segslam replay {shlex.quote(str(out))} --out NEW"

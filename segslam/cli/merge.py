@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from segslam.cli.checks import check_exists, check_own, make_room
+from segslam.cli.checks import check_exists, check_own, make_folder
 from segslam.cli.console import Terminal, print_out
 from segslam.cli.ending import finish, is_interrupted
 from segslam.cli.options import WITH_MAP, OverwriteOption, RunSettings, Settings, WithMapOption
@@ -35,7 +35,7 @@ def merge(
     """
     for folder in runs:
         check_exists(folder, "give the folders of finished runs")
-    from segslam.output.folder import check_new, new_folder
+    from segslam.output.folder import check_new
 
     if not overwrite:
         check_new(out)
@@ -49,8 +49,7 @@ def merge(
     settings = changes.load(base=sessions[0].run.config)
     merged = plan(sessions, config=settings, same_reference=same_reference, progress=terminal.progress)
     terminal.say(merged.summary())
-    make_room(out, overwrite=overwrite, inputs=runs)
-    folder = new_folder(out)
+    folder = make_folder(out, overwrite=overwrite, inputs=runs)
     when_stopped(f"the log in {folder} is kept, without results")
     with merged.begun(folder, settings) as run:
         if is_interrupted(terminal.progress(run.take(merged.steps()), merged.num_steps, "merge")):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.checks import check_run, make_room
+from segslam.cli.checks import check_run, make_folder
 from segslam.cli.console import Terminal
 from segslam.cli.ending import finish, is_interrupted
 from segslam.cli.options import WITH_MAP, FoxgloveOption, LogArgument, OverwriteOption, RunSettings, WithMapOption
@@ -105,7 +105,7 @@ def refine(
     check_run(run)
     changes.load()  # reports a wrong setting before the log is read
     terminal.announce(f"refine: reading {run}")
-    from segslam.output.folder import copy_alone, new_folder
+    from segslam.output.folder import copy_alone
     from segslam.run.replay import Replay
     from segslam.slam.slam import Slam
 
@@ -116,8 +116,7 @@ def refine(
     if refined.config.adjustment.max_minutes == 0.0:
         raise SegslamError("adjustment.max_minutes=0: nothing to do; give a limit with --refine-minutes")
     terminal.compile_kernels()
-    make_room(out, overwrite=overwrite, inputs=[run])
-    folder = new_folder(out)
+    folder = make_folder(out, overwrite=overwrite, inputs=[run])
     when_stopped(f"the log in {folder} is kept, without results")
     with refined.begun(folder, Slam(refined.config), options={}) as made:
         steps = made.take((step, 0, False) for step in recorded.whole_steps(len(recorded.keyframes())))
@@ -143,7 +142,7 @@ def _replay_log(
     `after` returns further figures, from the result. Raises typer.Exit(130) if Ctrl-C ended it early.
     """
     changes.load()  # reports a wrong setting before the log is read
-    from segslam.output.folder import copy_alone, new_folder
+    from segslam.output.folder import copy_alone
     from segslam.run.replay import Replay
 
     replayed = Replay.of(log, config=changes.config, settings=changes.overrides(), edits=edits)
@@ -156,8 +155,7 @@ def _replay_log(
     terminal.compile_kernels()
     with ExitStack() as stack:
         server = serve_foxglove(foxglove, stack, terminal)
-        make_room(out, overwrite=overwrite, inputs=[log])
-        folder = new_folder(out)
+        folder = make_folder(out, overwrite=overwrite, inputs=[log])
         when_stopped(f"the log in {folder} is kept, without results")
         run = stack.enter_context(replayed.begun(folder, slam, mirror=server.send if server else None))
         copy_alone(recorded.path.parent, folder)

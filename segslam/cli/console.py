@@ -119,8 +119,8 @@ class Terminal:
         return total
 
 
-def print_json(values: dict[str, Any]) -> None:
-    """Print one JSON object on standard output. Raises ValueError for NaN: callers must omit unknown figures."""
+def print_json(values: dict[str, Any] | list[Any]) -> None:
+    """Print one JSON value on standard output. Raises ValueError for NaN: callers must omit unknown figures."""
     print_out(json_text.dumps(values, allow_nan=False))
 
 

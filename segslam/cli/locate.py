@@ -1,7 +1,7 @@
 """`segslam locate` and `register`: poses of single scans, in a map or in another scan."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from json import dumps
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,21 +21,13 @@ if TYPE_CHECKING:
     from segslam.core.config import Config
     from segslam.core.threads import Stopwatch
     from segslam.core.types import Labels, Points, Rejected, Scan, ScanLabels
-    from segslam.run.locator import Located, Locator
+    from segslam.labels.label_files import LabelSource
+    from segslam.run.locator import Located
 
 LABEL_WORDS = ("geometric", "none")
 NOT_FOUND: dict[str, Any] = {"found": False} | dict.fromkeys(
     ("T_world_lidar", "keyframe", "inliers", "overlap", "probability", "evidence", "reason", "detail")
 )
-
-
-@dataclass(frozen=True)
-class _ListTerminal(Terminal):
-    """As `Terminal`; the figures are those of several scans."""
-
-    json: Annotated[
-        bool, typer.Option(help="Print a JSON list with one object per scan on standard output, and nothing else.")
-    ] = False
 
 
 @dataclass(frozen=True)
@@ -55,15 +47,26 @@ class ScanFileOptions:
                 f"--dataset {self.dataset}: only kitti needs a correction; omit the option for other data"
             )
 
-    def ready(self, file: Path, points: "Points", labels: "ScanLabels", config: "Config") -> "Scan":
-        """The usable points of a file, corrected, and their labels."""
+    def read(self, file: Path, labels: "Path | LabelSource", label_files: Sequence[Path], config: "Config") -> "Scan":
+        """The usable points of a file, corrected, with labels of a source, or of a file numbered as all `label_files`.
+
+        Raises SegslamError, naming the file, if one cannot be read.
+        """
+        from segslam.labels.label_files import encoding_of, read_labels
+        from segslam.scans.clouds import read_file
         from segslam.scans.dataset import make_scan
         from segslam.scans.kitti import VERTICAL_ANGLE_DEG
 
+        cloud = read_file(file)
+        classes: ScanLabels
+        if isinstance(labels, Path):
+            classes = read_labels(labels, len(cloud.points), self.encoding or encoding_of(label_files))
+        else:
+            classes = labels.read(file.stem, cloud.points, cloud.intensities)
         angle_deg = config.sensor.vertical_angle_deg
         if angle_deg is None:
             angle_deg = VERTICAL_ANGLE_DEG if self.dataset == "kitti" else 0.0
-        return make_scan(file, 0, 0, points, labels, vertical_angle_deg=angle_deg)
+        return make_scan(file, 0, 0, cloud.points, classes, vertical_angle_deg=angle_deg)
 
 
 class LabelsCommand(TyperCommand):
@@ -91,9 +94,11 @@ def locate(
         str, typer.Option(help="Labels: geometric, none, or a folder of .label files named like the scans.")
     ] = "geometric",
     files: ScanFileOptions,
-    terminal: _ListTerminal,
+    terminal: Terminal,
 ) -> None:
     """Find the poses of single scans in a finished run, without an initial guess. Exit status 1 if none is found.
+
+    `--json` prints a list with one object per scan.
 
     Example: segslam locate runs/00 004413.bin 000020.bin --dataset kitti
     """
@@ -103,6 +108,7 @@ def locate(
     for file in label_files:
         check_exists(file, "--labels: give geometric, none, or a folder with a .label file for each scan")
     terminal.announce(f"locate: reading {run}")
+    from segslam.labels.label_files import LabelSource, computed
     from segslam.run.locator import Locator
 
     files.check()
@@ -110,19 +116,21 @@ def locate(
     terminal.compile_kernels()
     num_bad = 0
     found = []
-    for scan in terminal.progress(scans, len(scans), "locate"):
+    sources: Sequence[Path | LabelSource] = label_files or len(scans) * [LabelSource(labels == "geometric")]
+    for scan, source in terminal.progress(list(zip(scans, sources, strict=True)), len(scans), "locate"):
         started = perf_counter()
         try:
-            points, classes = _read_one(scan, label_files, labels, files, locator)
+            ready = files.read(scan, source, label_files, locator.config)
+            classes = None if labels == "geometric" else computed(ready.labels)
         except SegslamError as error:
             num_bad += 1
             one = NOT_FOUND | {"reason": "unreadable", "detail": str(error).partition("; ")[0]}
         else:
             started = perf_counter()
-            one = _place(locator.locate(points, classes))
+            one = _place(locator.locate(ready.points, classes))
         found.append(one | {"seconds": perf_counter() - started})
     if terminal.json:
-        print_out(dumps(found, allow_nan=False))
+        print_json(found)
     else:
         _show_places(scans, found, terminal)
     if num_bad:
@@ -169,69 +177,39 @@ def register(
     chosen = find_method(method)
     terminal.compile_kernels()
     watch = Stopwatch()
-    clouds = _read_two(source, target, labels, files, settings, watch)
+    clouds = _read_two((source, target), labels or ["geometric"], files, settings, watch)
     scans: list[dict[str, Any]] = []
     for name, (points, classes) in zip(("source", "target"), clouds, strict=True):
         with watch(f"describe_{name}"):
             scans.append(prepare_parts(points, classes, methods=[method], config=settings)[0])
     found = chosen.align(scans[0], scans[1], settings, watch)
     figures = _pose(found, watch)
-    _show_pose(figures, terminal)
+    if terminal.json:
+        print_json(figures)
+    elif figures["accepted"]:
+        _show_pose(figures, terminal)
     if not figures["accepted"]:
         say(f"rejected: {figures['reason']} ({figures['detail']})")
         raise typer.Exit(1)
 
 
-def _read_one(
-    scan: Path, label_files: list[Path], labels: str, files: ScanFileOptions, locator: "Locator"
-) -> tuple["Points", "Labels | None"]:
-    """Points of a scan and their labels; None for labels if they are to be computed from geometry."""
-    import numpy as np
-
-    from segslam.labels.label_files import computed, encoding_of, read_labels
-    from segslam.scans.clouds import read_file
-
-    points = read_file(scan).points
-    ids = np.zeros(len(points), np.uint8)
-    if label_files:
-        numbering = files.encoding or encoding_of(label_files)
-        ids = read_labels(Path(labels) / f"{scan.stem}.label", len(points), numbering)
-    ready = files.ready(scan, points, ids, locator.config)
-    return ready.points, None if labels == "geometric" else computed(ready.labels)
-
-
 def _read_two(
-    source: Path,
-    target: Path,
-    labels: list[str] | None,
-    files: ScanFileOptions,
-    config: "Config",
-    watch: "Stopwatch",
+    both: tuple[Path, Path], words: list[str], files: ScanFileOptions, config: "Config", watch: "Stopwatch"
 ) -> list[tuple["Points", "Labels"]]:
     """Points and labels of the two scans."""
     from segslam.labels import geometric_labels
-    from segslam.labels.label_files import computed, encoding_of, open_labels, read_labels
-    from segslam.scans.clouds import read_file
+    from segslam.labels.label_files import computed, open_labels
 
     files.check()
-    both = (source, target)
-    stored = [read_file(file) for file in both]
-    words = labels or ["geometric"]
-    classes: list[ScanLabels]
-    if len(words) == 2:
-        named = [Path(word) for word in words]
-        numbering = files.encoding or encoding_of(named)
-        classes = [read_labels(file, len(cloud.points), numbering) for file, cloud in zip(named, stored, strict=True)]
-    elif _is_word(words[0]):
-        labeller = open_labels(words[0], beside=source.parent, scan_names=(), encoding=None)
-        classes = [
-            labeller.read(file.stem, cloud.points, cloud.intensities) for file, cloud in zip(both, stored, strict=True)
-        ]
-    else:
+    label_files = [Path(word) for word in words] if len(words) == 2 else []
+    sources: Sequence[Path | LabelSource] = label_files
+    if _is_word(words[0]) and not label_files:
+        sources = 2 * [open_labels(words[0], beside=both[0].parent, scan_names=(), encoding=None)]
+    elif not label_files:
         raise SegslamError(
             f"--labels {words[0]}: give two .label files, source and target, or geometric, or network:MODEL"
         )
-    scans = [files.ready(file, one.points, ids, config) for file, one, ids in zip(both, stored, classes, strict=True)]
+    scans = [files.read(file, labels, label_files, config) for file, labels in zip(both, sources, strict=True)]
     with watch("label"):
         return [
             (scan.points, geometric_labels(scan.points) if words[0] == "geometric" else computed(scan.labels))
@@ -288,11 +266,6 @@ def _show_pose(figures: dict[str, Any], terminal: Terminal) -> None:
 
     from segslam.core.types import probability_text
 
-    if terminal.json:
-        print_json(figures)
-        return
-    if not figures["accepted"]:
-        return
     rows = np.array(figures["T_target_source"]).reshape(4, 4)
     print_out("\n".join(" ".join(f"{value:12.6f}" for value in row) for row in rows))
     overlap = "" if figures["overlap"] is None else f", overlap {figures['overlap']:.2f}"

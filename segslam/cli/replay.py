@@ -1,6 +1,6 @@
 """`segslam replay`, `edit` and `refine`: a new run from the log of another."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from itertools import chain, tee
 from pathlib import Path
@@ -73,20 +73,9 @@ def edit(
     Example: segslam edit runs/00 --forbid 120:15 --add 300:40 --out runs/00-edited
     """
     check_run(run)
-    edits = _edits(run, forbid or [], add or [], add_near_fixes=add_near_fixes)
     terminal.announce(f"edit: reading {run}")
-    _check_keyframes(run, edits, terminal)
-
-    from segslam.slam.slam_result import outcome_text
-
-    def after(result: "SlamResult") -> dict[str, Any]:
-        weights = result.estimate.closure_weights
-        outcomes = {attempt.candidate.pair: outcome_text(attempt, weights) for attempt in result.attempts}
-        for pair in sorted(edits.added):
-            terminal.say(f"added {pair[0]}:{pair[1]}: {outcomes.get(pair, 'not tried, because the run ended before')}")
-        return {}
-
-    _replay_log(run, out, changes, terminal, edits=edits, after=after, overwrite=overwrite)
+    edits = _edits(run, forbid or [], add or [], add_near_fixes=add_near_fixes, terminal=terminal)
+    _replay_log(run, out, changes, terminal, edits=edits, overwrite=overwrite)
 
 
 def refine(
@@ -134,16 +123,22 @@ def _replay_log(
     *,
     foxglove: str | None = None,
     edits: LoopEdits = NO_EDITS,
-    after: "Callable[[SlamResult], dict[str, Any]]" = lambda result: {},
     overwrite: bool,
 ) -> None:
-    """Repeat a run from its log into a new folder; `edits` follow those of the run.
-
-    `after` returns further figures, from the result. Raises typer.Exit(130) if Ctrl-C ended it early.
-    """
+    """Repeat a run from its log into a new folder; `edits` follow those of the run. Exits if Ctrl-C ended it early."""
     changes.load()  # reports a wrong setting before the log is read
     from segslam.output.folder import copy_alone
     from segslam.run.replay import Replay
+    from segslam.slam.slam_result import outcome_text
+
+    before, now = set[Pair](), set[Pair]()
+
+    def more(result: "SlamResult") -> dict[str, Any]:
+        weights = result.estimate.closure_weights
+        outcomes = {attempt.candidate.pair: outcome_text(attempt, weights) for attempt in result.attempts}
+        for pair in sorted(edits.added):
+            terminal.say(f"added {pair[0]}:{pair[1]}: {outcomes.get(pair, 'not tried, because the run ended before')}")
+        return _compared(recorded, before, now)
 
     replayed = Replay.of(log, config=changes.config, settings=changes.overrides(), edits=edits)
     recorded = replayed.recorded
@@ -159,13 +154,12 @@ def _replay_log(
         when_stopped(f"the log in {folder} is kept, without results")
         run = stack.enter_context(replayed.begun(folder, slam, mirror=server.send if server else None))
         copy_alone(recorded.path.parent, folder)
-        before, now = set[Pair](), set[Pair]()
         steps = _repeated(recorded, run, before, now)
         stopped = is_interrupted(terminal.progress(steps, recorded.num_steps(), "replay"))
         if stopped and run.num_steps == 0:
             when_stopped("nothing was written")
             raise typer.Exit(EXIT_STATUS)
-        finish(run, terminal, more=lambda result: _compared(recorded, before, now) | after(result), stopped=stopped)
+        finish(run, terminal, more=more, stopped=stopped)
     if stopped:
         when_stopped(f"{run.num_steps} of {recorded.num_steps()} steps were replayed; results in {folder}")
         raise typer.Exit(EXIT_STATUS)
@@ -199,8 +193,12 @@ def _closures(step: "Step") -> set[Pair]:
     return {outcome.pair for outcome in outcomes if isinstance(outcome, LoopClosure)}
 
 
-def _edits(run: Path, forbid: list[str], add: list[str], *, add_near_fixes: bool) -> LoopEdits:
-    """The edits of the options. Raises SegslamError if there are none."""
+def _edits(run: Path, forbid: list[str], add: list[str], *, add_near_fixes: bool, terminal: Terminal) -> LoopEdits:
+    """The edits of the options.
+
+    Raises SegslamError if there are none, for a keyframe that the run does not have, and for a run localised in a map.
+    A pair that is forbidden but was never tried is reported: it may be a mistyped id.
+    """
     forbidden, added = pairs_of(forbid, "--forbid"), pairs_of(add, "--add")
     if add_near_fixes:
         from segslam.run.replay import pairs_near_fixes
@@ -209,26 +207,18 @@ def _edits(run: Path, forbid: list[str], add: list[str], *, add_near_fixes: bool
     if not forbidden | added:
         remedy = "the fixes propose no further loop" if add_near_fixes else "give --forbid I:J or --add I:J"
         raise SegslamError(f"nothing to edit: {remedy}")
-    return LoopEdits(forbidden, added)
-
-
-def _check_keyframes(run: Path, edits: LoopEdits, terminal: Terminal) -> None:
-    """Raises SegslamError for a keyframe that the run does not have, and for a run localised in a map.
-
-    A pair that is forbidden but was never tried is reported: it may be a mistyped id.
-    """
     from segslam.output.log import read_log
 
     recorded = read_log(run)
     if recorded.options.get("in_map"):
         raise SegslamError(f"{run}: localised in the map of another run, without loops of its own; edit that run")
     num = len(recorded.keyframes())
-    for newer, older in sorted(edits.forbidden | edits.added):
+    for newer, older in sorted(forbidden | added):
         if newer >= num:
             raise SegslamError(f"{newer}:{older}: {run} has keyframes 0 to {num - 1}; the report shows their ids")
-    attempts = chain(
-        (attempt for step in recorded.steps(clouds=False) for attempt in step.attempts), recorded.late_loops()
-    )
+    steps = recorded.steps(clouds=False)
+    attempts = chain((attempt for step in steps for attempt in step.attempts), recorded.late_loops())
     tried = {attempt.candidate.pair for attempt in attempts}
-    for newer, older in sorted(edits.forbidden - tried):
+    for newer, older in sorted(forbidden - tried):
         terminal.say(f"{newer}:{older}: {run} has not tried this loop; forbidden all the same (loops.csv has the ids)")
+    return LoopEdits(forbidden, added)

@@ -248,25 +248,6 @@ def _read_lists(
     return [sample_pairs(one, num_pairs=options.sample, seed=options.seed) for one in lists]
 
 
-def _run_trials(job: "Job", trials: list["Trial"], options: Options, terminal: Terminal) -> list["Row"]:
-    """All rows in the order of the trials. After Ctrl-C, finished rows remain in the folder of `--out`."""
-    from segslam.bench.experiments.benchmark import in_order, run
-    from segslam.bench.experiments.rows import write_rows
-
-    terminal.compile_kernels()
-    rows: list[Row] = []
-    kept = f"are kept in {options.out}; the same command continues" if options.out else "are lost; --out keeps them"
-    when_stopped(f"the finished registrations {kept}")
-    work = run(job, trials, workers=options.workers, scheduler=options.scheduler, folder=options.out)
-    if is_interrupted(map(rows.extend, terminal.progress(work, len(trials), "bench"))):
-        when_stopped(f"{len(rows)} registrations {kept}")
-        raise typer.Exit(EXIT_STATUS)
-    rows = in_order(rows, job, trials)
-    if options.details is not None:
-        write_rows(options.details, rows)
-    return rows
-
-
 def _experiment(
     name: str,
     data: Path,
@@ -284,17 +265,28 @@ def _experiment(
     report.
     """
     job = _make_job(data, options, changes, terminal)
+    from segslam.bench.experiments.benchmark import in_order, run
     from segslam.bench.experiments.job import open_once
     from segslam.bench.experiments.pairs import PAPER_PAIR, pair_trials
     from segslam.bench.experiments.paper import with_paper_values
     from segslam.bench.experiments.provenance import account
     from segslam.bench.experiments.report_tables import overall, plain
-    from segslam.bench.experiments.rows import results
+    from segslam.bench.experiments.rows import results, write_rows
 
     reference = open_once(job.source)[0].reference
     lists = _read_lists(options, reference, default=PAPER_PAIR if varied else None)
     trials = [trial for one in lists for trial in pair_trials(one, reference, **varied)]
-    rows = _run_trials(job, trials, options, terminal)
+    terminal.compile_kernels()
+    rows: list[Row] = []
+    kept = f"are kept in {options.out}; the same command continues" if options.out else "are lost; --out keeps them"
+    when_stopped(f"the finished registrations {kept}")
+    work = run(job, trials, workers=options.workers, scheduler=options.scheduler, folder=options.out)
+    if is_interrupted(map(rows.extend, terminal.progress(work, len(trials), "bench"))):
+        when_stopped(f"{len(rows)} registrations {kept}")
+        raise typer.Exit(EXIT_STATUS)
+    rows = in_order(rows, job, trials)
+    if options.details is not None:
+        write_rows(options.details, rows)
     found = with_paper_values(results(rows, by=by), experiment=name, sequence=options.sequence, lists=lists)
     if options.out is not None:
         from segslam.bench.experiments.report import write_bench_report

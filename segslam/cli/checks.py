@@ -150,11 +150,11 @@ def preset_config(name: str, scans: "Dataset", terminal: Terminal) -> "Config":
     """The settings of a preset; with `auto`, of the preset that fits the scans, with a message."""
     from segslam.scans.presets import extent_m, preset, preset_for
 
-    if name != "auto":
-        return preset(cast("Preset", name))
-    extent = extent_m(scans)
-    show_preset(preset_for(extent), extent, terminal)
-    return preset(preset_for(extent))
+    if name == "auto":
+        extent = extent_m(scans)
+        name = preset_for(extent)
+        show_preset(name, extent, terminal)
+    return preset(cast("Preset", name))
 
 
 def live_configs(name: str, output: Settings) -> "dict[Preset, Config]":

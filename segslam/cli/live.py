@@ -69,9 +69,7 @@ def live(
     """
     if output.view:
         check_display()
-    _check_source(folder, topic, out)
-    if gnss.gnss is not None:
-        _check_ros("--gnss")
+    _check_source(folder, topic, gnss.gnss, out)
     output.load()  # reports a wrong setting before large libraries are loaded
     if labels not in ("auto", "geometric", "none"):
         raise SegslamError(f"--labels {labels}: live scans get geometric labels; give geometric or none")
@@ -112,7 +110,7 @@ def live(
         slam = Slam(settings, labeller=(lambda points: unlabelled(len(points))) if labels == "none" else None)
         mirror = server.send if server else None
         run = stack.enter_context(Run(out, slam, dataset=source.name, options=recorded, mirror=mirror))
-        publisher = _publisher(source, run, stack)
+        publisher = _publisher(run, stack) if folder is None else None
         with LiveMap(_shows(server, publisher)) as live_map:
             figures = _follow(front, run, terminal, scene=scene, live_map=live_map, publisher=publisher)
         ended = front.ended
@@ -188,8 +186,8 @@ def _shows(server: "FoxgloveServer | None", publisher: "MappingPublisher | None"
     return shows
 
 
-def _check_source(folder: Path | None, topic: str | None, out: Path) -> None:
-    """Raises SegslamError unless exactly one source is given; called before large libraries are imported."""
+def _check_source(folder: Path | None, topic: str | None, fixes: str | None, out: Path) -> None:
+    """Raises SegslamError unless there is one source, and ROS 2 for topics; before large libraries are imported."""
     if (folder is None) == (topic is None):
         raise SegslamError(
             "give one source: a folder into which scans are written, as in segslam live /data/scans --out runs/now, "
@@ -199,15 +197,11 @@ def _check_source(folder: Path | None, topic: str | None, out: Path) -> None:
         check_exists(folder, "give the folder into which scans are written")
         if not folder.is_dir():
             raise SegslamError(f"{folder}: not a folder; for a recording: segslam map {folder} --out {out}")
-    else:
-        _check_ros("--topic")
-
-
-def _check_ros(option: str) -> None:
-    if find_spec("rclpy") is None:
-        raise SegslamError(
-            f"{option} needs ROS 2: source its setup script (Jazzy, Kilted), or: {how_to_install('ros')}"
-        )
+    for option, value in (("--topic", topic), ("--gnss", fixes)):
+        if value is not None and find_spec("rclpy") is None:
+            raise SegslamError(
+                f"{option} needs ROS 2: source its setup script (Jazzy, Kilted), or: {how_to_install('ros')}"
+            )
 
 
 def _source(folder: Path | None, topic: str | None, *, intensities: bool, vertical_angle_deg: float) -> "Source":
@@ -224,13 +218,9 @@ def _source(folder: Path | None, topic: str | None, *, intensities: bool, vertic
     return TopicSource(topic or "", intensities=intensities, vertical_angle_deg=vertical_angle_deg)
 
 
-def _publisher(source: "Source", run: "Run", stack: ExitStack) -> "MappingPublisher | None":
-    """The publisher of path and map if the source is a topic; it also saves the map on request."""
-    from segslam.run.live.folder import FolderSource
+def _publisher(run: "Run", stack: ExitStack) -> "MappingPublisher":
+    """The publisher of path and map, for a topic; it also saves the map on request."""
     from segslam.run.live.live_map import save_map
-
-    if isinstance(source, FolderSource):
-        return None
     from segslam.run.live.ros import MappingPublisher
 
     def save() -> str:

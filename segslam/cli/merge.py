@@ -8,7 +8,7 @@ import typer
 from segslam.cli.checks import check_exists, check_own, make_folder
 from segslam.cli.console import Terminal, print_out
 from segslam.cli.ending import finish, is_interrupted
-from segslam.cli.options import WITH_MAP, OverwriteOption, RunSettings, Settings, WithMapOption
+from segslam.cli.options import WITH_MAP, RunSettings, Settings, WithMapOption
 from segslam.core.errors import SegslamError
 from segslam.core.interrupts import EXIT_STATUS, when_stopped
 
@@ -22,7 +22,6 @@ def merge(
     ] = False,
     with_map: WithMapOption = False,
     changes: RunSettings,
-    overwrite: OverwriteOption = False,
     terminal: Terminal,
 ) -> None:
     """Merge runs that share places into one run: one frame, one map, one log.
@@ -37,7 +36,7 @@ def merge(
         check_exists(folder, "give the folders of finished runs")
     from segslam.output.folder import check_new
 
-    if not overwrite:
+    if not changes.overwrite:
         check_new(out)
     changes.load()  # reports a wrong setting before the logs are read
     terminal.announce(f"merge: reading {len(runs)} runs")
@@ -49,7 +48,7 @@ def merge(
     settings = changes.load(base=sessions[0].run.config)
     merged = plan(sessions, config=settings, same_reference=same_reference, progress=terminal.progress)
     terminal.say(merged.summary())
-    folder = make_folder(out, overwrite=overwrite, inputs=runs)
+    folder = make_folder(out, overwrite=changes.overwrite, inputs=runs)
     when_stopped(f"the log in {folder} is kept, without results")
     with merged.begun(folder, settings) as run:
         if is_interrupted(terminal.progress(run.take(merged.steps()), merged.num_steps, "merge")):

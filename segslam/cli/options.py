@@ -110,6 +110,8 @@ class RunSettings(Settings):
         ),
     ] = None
 
+    overwrite: OverwriteOption = False
+
     def overrides(self) -> list[str]:
         """Those of `--set`, followed by that of `--refine-minutes`."""
         minutes = [] if self.refine_minutes is None else [f"adjustment.max_minutes={self.refine_minutes}"]
@@ -129,7 +131,6 @@ class RunOutput(RunSettings):
     ] = None
     view: ViewOption = False
     foxglove: FoxgloveOption = None
-    overwrite: OverwriteOption = False
 
     def maps(self, folder: Path) -> tuple[list[Path], list[Path]]:
         """Map files as given, and as paths in the run folder. Raises SegslamError if one cannot be written."""
@@ -159,22 +160,11 @@ class ScanOptions:
         str, typer.Option(help="Point cloud topic, if the recording (rosbag, mcap) has more than one.")
     ] = ""
 
-    def source(
-        self, data: Path, labels: str = "none", encoding: Any = None, *, vertical_angle_deg: float | None = None
-    ) -> "DataSource":
+    def source(self, data: Path, labels: str = "none", encoding: Any = None) -> "DataSource":
         """What opens the scans."""
         from segslam.scans import DataSource
 
-        return DataSource(
-            data,
-            self.sequence,
-            self.dataset,
-            labels,
-            encoding,
-            self.frames,
-            self.topic,
-            vertical_angle_deg=vertical_angle_deg,
-        )
+        return DataSource(data, self.sequence, self.dataset, labels, encoding, self.frames, self.topic)
 
 
 @dataclass(frozen=True)

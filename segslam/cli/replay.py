@@ -11,7 +11,7 @@ import typer
 from segslam.cli.checks import check_run, make_folder
 from segslam.cli.console import Terminal
 from segslam.cli.ending import finish, is_interrupted
-from segslam.cli.options import WITH_MAP, FoxgloveOption, LogArgument, OverwriteOption, RunSettings, WithMapOption
+from segslam.cli.options import WITH_MAP, FoxgloveOption, LogArgument, RunSettings, WithMapOption
 from segslam.cli.viewers import serve_foxglove
 from segslam.core.errors import SegslamError
 from segslam.core.interrupts import EXIT_STATUS, when_stopped
@@ -32,7 +32,6 @@ def replay(
     out: OutOption,
     changes: RunSettings,
     foxglove: FoxgloveOption = None,
-    overwrite: OverwriteOption = False,
     terminal: Terminal,
 ) -> None:
     """Repeat loop closing and optimisation from the log of a run, with some settings changed.
@@ -41,7 +40,7 @@ def replay(
     """
     check_run(log)
     terminal.announce(f"replay: reading {log}")
-    _replay_log(log, out, changes, terminal, foxglove=foxglove, overwrite=overwrite)
+    _replay_log(log, out, changes, terminal, foxglove=foxglove)
 
 
 def edit(
@@ -62,7 +61,6 @@ def edit(
         bool, typer.Option(help="Add keyframes that the fixes of the run place near each other.")
     ] = False,
     changes: RunSettings,
-    overwrite: OverwriteOption = False,
     terminal: Terminal,
 ) -> None:
     """Forbid or add loops by hand, and repeat the run with them. Keyframes have the ids of loops.csv and the report.
@@ -75,7 +73,7 @@ def edit(
     check_run(run)
     terminal.announce(f"edit: reading {run}")
     edits = _edits(run, forbid or [], add or [], add_near_fixes=add_near_fixes, terminal=terminal)
-    _replay_log(run, out, changes, terminal, edits=edits, overwrite=overwrite)
+    _replay_log(run, out, changes, terminal, edits=edits)
 
 
 def refine(
@@ -84,7 +82,6 @@ def refine(
     out: Annotated[Path, typer.Option(help="New folder for the adjusted run.")],
     with_map: WithMapOption = False,
     changes: RunSettings,
-    overwrite: OverwriteOption = False,
     terminal: Terminal,
 ) -> None:
     """Adjust the whole map of a run: register submaps of its keyframes, and optimise all poses. Its loops are kept.
@@ -105,7 +102,7 @@ def refine(
     if refined.config.adjustment.max_minutes == 0.0:
         raise SegslamError("adjustment.max_minutes=0: nothing to do; give a limit with --refine-minutes")
     terminal.compile_kernels()
-    folder = make_folder(out, overwrite=overwrite, inputs=[run])
+    folder = make_folder(out, overwrite=changes.overwrite, inputs=[run])
     when_stopped(f"the log in {folder} is kept, without results")
     with refined.begun(folder, Slam(refined.config), options={}) as made:
         steps = made.take((step, 0, False) for step in recorded.whole_steps(len(recorded.keyframes())))
@@ -123,7 +120,6 @@ def _replay_log(
     *,
     foxglove: str | None = None,
     edits: LoopEdits = NO_EDITS,
-    overwrite: bool,
 ) -> None:
     """Repeat a run from its log into a new folder; `edits` follow those of the run. Exits if Ctrl-C ended it early."""
     changes.load()  # reports a wrong setting before the log is read
@@ -150,7 +146,7 @@ def _replay_log(
     terminal.compile_kernels()
     with ExitStack() as stack:
         server = serve_foxglove(foxglove, stack, terminal)
-        folder = make_folder(out, overwrite=overwrite, inputs=[log])
+        folder = make_folder(out, overwrite=changes.overwrite, inputs=[log])
         when_stopped(f"the log in {folder} is kept, without results")
         run = stack.enter_context(replayed.begun(folder, slam, mirror=server.send if server else None))
         copy_alone(recorded.path.parent, folder)

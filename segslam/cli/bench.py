@@ -11,6 +11,7 @@ import typer
 
 from segslam.bench.experiments.method_settings import METHOD_NAMES
 from segslam.cli.checks import check_free, check_own
+from segslam.cli.commands import GroupedCommands
 from segslam.cli.console import Terminal
 from segslam.cli.ending import is_interrupted
 from segslam.cli.options import (
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from segslam.core.types import Trajectory
 
 app = typer.Typer(
+    cls=GroupedCommands,
     help="Repeat the experiments of the Segregator paper; every method gets the same scans.\n\n"
     "Example: segslam bench pairs kitti --sequence 06 --pairs kitti06_3to5.txt --sample 100 --out bench06",
     no_args_is_help=True,

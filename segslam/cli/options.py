@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import typer
 from typer.models import OptionInfo
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 WITH_MAP = ("map.ply", "map.png")
 """Files that `--map` writes into the run folder."""
 
+VALUE_NAMES: dict[Any, str] = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
 GNSS_USES = ("fuse", "align")
 MOST_OFFSET_S = 4e9
 """As far as the clock of a computer that begins in 1970 can be off."""
@@ -253,7 +254,8 @@ class GnssOptions:
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
     """The command with the fields of each parameter that is annotated with a dataclass in place of that parameter.
 
-    An option without a name of its own is called like its parameter; a flag has no opposite `--no-...`.
+    An option without a name of its own is called like its parameter; a flag has no opposite `--no-...`. The help shows
+    PATH, TEXT, N or NUMBER for a value, also for lists and optional values.
     """
     own = inspect.signature(command, eval_str=True)
     records: dict[str, type[Any]] = {
@@ -275,8 +277,15 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     ]
     for one in parameters:
         option = one.annotation.__metadata__[0]
-        if isinstance(option, OptionInfo) and option.default is ...:  # where typer has the first name
-            option.param_decls = (f"--{one.name.replace('_', '-')}",)
+        if isinstance(option, OptionInfo):
+            option.metavar = option.metavar or _value_name(one.annotation.__origin__)
+            if option.default is ...:  # where typer has the first name
+                option.param_decls = (f"--{one.name.replace('_', '-')}",)
     flat.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
     flat.__annotations__ = {one.name: one.annotation for one in parameters}
     return flat
+
+
+def _value_name(hint: Any) -> str | None:
+    """None for flags and choices."""
+    return VALUE_NAMES.get(hint) or next(filter(None, map(_value_name, get_args(hint))), None)

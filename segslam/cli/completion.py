@@ -1,18 +1,19 @@
 """Values offered by the shell, which typer filters by what is typed; modules that know them are imported only then."""
 
+import os
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 
 def labels_or_files(incomplete: str) -> list[str]:
     """Sources of labels, and the paths that begin so: a completion of its own replaces the shell's file names."""
-    parent = Path(incomplete).expanduser()
-    parent = parent if incomplete.endswith("/") else parent.parent
+    folder = incomplete[: incomplete.rfind("/") + 1]
     try:
-        paths = [f"{path}/" if path.is_dir() else str(path) for path in parent.iterdir()]
+        paths = sorted(Path(os.path.expanduser(folder)).iterdir())
+        names = [f"{folder}{path.name}{'/' if path.is_dir() else ''}" for path in paths]
     except OSError:
-        paths = []
-    return ["auto", "none", "geometric", "network:", *sorted(paths)]
+        names = []
+    return ["auto", "none", "geometric", "network:", *names]
 
 
 def presets() -> list[str]:

@@ -50,3 +50,13 @@ def test_labels_are_words_or_paths(offered: Offered, tmp_path: Path, monkeypatch
     monkeypatch.chdir(tmp_path)
     assert set(offered("map data --labels geo")) == {"geometric", "geo.label", "geo/"}
     assert offered("map data --labels missing/") == []
+
+
+def test_paths_are_offered_as_they_are_begun(offered: Offered, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mine" / "labels").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for begun in ("./mi", "~/mi", f"{tmp_path}/mi"):
+        assert offered(f"map data --labels {begun}") == [f"{begun}ne/"]
+    assert offered("map data --labels ~/mine/") == ["~/mine/labels/"]
+    assert offered("map data --labels ~nosuch/") == []

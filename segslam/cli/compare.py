@@ -145,10 +145,11 @@ def grid_of(settings: Sequence[str]) -> dict[str, list[str]]:
     """Name -> settings of each combination. Raises SegslamError for a text without values."""
     choices = []
     for text in settings:
-        key, _, values = text.partition("=")
+        key, _, listed = text.partition("=")
+        values = [value for value in listed.split(",") if value]
         if not key or not values:
             raise SegslamError(f"--set {text}: give values, as in --set verify.max_false_share=0.01,0.001")
-        choices.append([f"{key}={value}" for value in values.split(",") if value])
+        choices.append([f"{key}={value}" for value in values])
     return {" ".join(combination): list(combination) for combination in product(*choices)}
 
 

@@ -17,8 +17,9 @@ pytestmark = pytest.mark.usefixtures("short_runs")
 
 def test_all_combinations_are_made() -> None:
     assert grid_of(["a.b=1,2", "c.d=x"]) == {"a.b=1 c.d=x": ["a.b=1", "c.d=x"], "a.b=2 c.d=x": ["a.b=2", "c.d=x"]}
-    with pytest.raises(SegslamError, match="give values"):
-        grid_of(["a.b"])
+    for empty in ("a.b", "a.b=", "a.b=,"):
+        with pytest.raises(SegslamError, match="give values"):
+            grid_of([empty])
 
 
 def test_a_sweep_replays_each_value_once_and_tables_it(

@@ -17,7 +17,7 @@ from segslam.core.errors import SegslamError, WorkFailed
 from segslam.core.interrupts import when_stopped
 
 SOURCE = "replayed.txt"
-"""File in the folder of a sweep: the log that its runs replay."""
+"""File in the folder of a sweep: the log that its runs replay, and the time of its last change."""
 
 
 def compare(
@@ -116,9 +116,13 @@ def sweep(
     for changes in grid.values():  # reports a wrong setting before anything is replayed
         changed_config(recorded, settings=changes)
     out.mkdir(parents=True, exist_ok=True)
-    _check_same(log_of(run), out / SOURCE)
+    log, note = log_of(run), out / SOURCE
+    source = f"{log.resolve()} of {log.stat().st_mtime_ns} ns\n"
+    if note.is_file() and note.read_text(encoding="utf-8") != source:
+        raise SegslamError(f"{out}: has replays of another log; give another folder")
+    note.write_text(source, encoding="utf-8")
     when_stopped(f"what is done is kept in {out}; call the same command again to go on")
-    tasks = [(str(log_of(run).resolve()), str((out / name).resolve()), changes) for name, changes in grid.items()]
+    tasks = [(str(log.resolve()), str((out / name).resolve()), changes) for name, changes in grid.items()]
     rows: dict[str, dict[str, Any]] = {name: {} for name in grid}
     failures = []
     with started(out.resolve(), number=workers, scheduler=scheduler) as (work, _):
@@ -131,14 +135,6 @@ def sweep(
     terminal.say(f"runs in {out}")
     if failures:
         raise WorkFailed("; ".join(failures))
-
-
-def _check_same(log: Path, note: Path) -> None:
-    """Note the log in a file. Raises SegslamError if another one, or another state of it, is noted there."""
-    text = f"{log.resolve()} of {log.stat().st_mtime_ns} ns\n"
-    if note.is_file() and note.read_text(encoding="utf-8") != text:
-        raise SegslamError(f"{note.parent}: has replays of another log; give another folder")
-    note.write_text(text, encoding="utf-8")
 
 
 def grid_of(settings: Sequence[str]) -> dict[str, list[str]]:

@@ -10,7 +10,7 @@ import typer
 
 from segslam.cli import completion
 from segslam.cli.checks import check_exists, check_free, check_own, check_run
-from segslam.cli.console import Terminal, print_json, print_out
+from segslam.cli.console import Terminal, print_json
 from segslam.cli.options import OverwriteOption
 from segslam.cli.tables import TableFiles, as_text, figure, with_meaning
 from segslam.core.errors import SegslamError, WorkFailed
@@ -50,7 +50,7 @@ def compare(
     if terminal.json:
         print_json({"runs": figures, "plot": None if plot is None else str(plot)})
         return
-    print_out(_table(figures))
+    print(_table(figures), flush=True)
     if plot is not None:
         terminal.say(f"figure written to {plot}")
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from segslam.core.errors import WorkFailed, reason
+from segslam.core.errors import WorkFailed
 
 logger = logging.getLogger(__name__)
 Item = TypeVar("Item")
@@ -89,7 +89,7 @@ class Terminal:
         if self.json:
             print_json(figures)
         elif not self.quiet:
-            print_out(text)
+            print(text, flush=True)
 
     def progress(self, items: Iterable[Item], total: int, title: str) -> Iterator[Item]:
         """Yield the items; show a bar on a terminal, or print a line every ten seconds; no output if quiet."""
@@ -121,17 +121,7 @@ class Terminal:
 
 def print_json(values: dict[str, Any] | list[Any]) -> None:
     """Print one JSON value on standard output. Raises ValueError for NaN: callers must omit unknown figures."""
-    print_out(json_text.dumps(values, allow_nan=False))
-
-
-def print_out(text: str) -> None:
-    """Print lines on standard output. Raises WorkFailed on a write error, for example a full disk."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise WorkFailed(f"standard output: cannot be written ({reason(error)}); redirect it elsewhere") from error
+    print(json_text.dumps(values, allow_nan=False), flush=True)
 
 
 def say(text: str) -> None:

@@ -12,7 +12,7 @@ from typer.core import TyperCommand
 from segslam.bench.experiments.method_settings import METHOD_NAMES, check_method
 from segslam.cli.checks import check_exists
 from segslam.cli.completion import labels_or_files
-from segslam.cli.console import Terminal, print_json, print_out, say
+from segslam.cli.console import Terminal, print_json, say
 from segslam.cli.options import EncodingOption, Settings
 from segslam.core.errors import SegslamError
 
@@ -238,7 +238,7 @@ def _show_places(scans: list[Path], found: list[dict[str, Any]], terminal: Termi
     """Print file and pose of each scan on standard output, and details on standard error."""
     for scan, one in zip(scans, found, strict=True):
         if one["found"]:
-            print_out(f"{scan} " + " ".join(f"{value:.6f}" for value in one["T_world_lidar"]))
+            print(f"{scan} " + " ".join(f"{value:.6f}" for value in one["T_world_lidar"]), flush=True)
             terminal.say(
                 f"{scan}: at keyframe {one['keyframe']}, {one['inliers']} inliers, overlap {one['overlap']:.2f}, "
                 f"probability {one['probability']:.4f}, {1000 * one['seconds']:.0f} ms"
@@ -267,7 +267,7 @@ def _show_pose(figures: dict[str, Any], terminal: Terminal) -> None:
     from segslam.core.types import probability_text
 
     rows = np.array(figures["T_target_source"]).reshape(4, 4)
-    print_out("\n".join(" ".join(f"{value:12.6f}" for value in row) for row in rows))
+    print("\n".join(" ".join(f"{value:12.6f}" for value in row) for row in rows), flush=True)
     overlap = "" if figures["overlap"] is None else f", overlap {figures['overlap']:.2f}"
     times = ", ".join(f"{stage} {1000 * seconds:.0f} ms" for stage, seconds in figures["seconds"].items())
     if figures["probability"] is not None:

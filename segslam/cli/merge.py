@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from segslam.cli.checks import check_exists, check_own, make_folder
-from segslam.cli.console import Terminal, print_out
+from segslam.cli.console import Terminal
 from segslam.cli.ending import finish, is_interrupted
 from segslam.cli.options import WITH_MAP, RunSettings, Settings, WithMapOption
 from segslam.core.errors import SegslamError
@@ -113,7 +113,7 @@ def fleet(
         say=terminal.say,
     )
     if terminal.json:
-        print_out((result.folder / FILE).read_text(encoding="utf-8").rstrip())
+        print((result.folder / FILE).read_text(encoding="utf-8").rstrip(), flush=True)
         return
     for number, component in enumerate(result.components):
         error = f", error {component['ate_m']:.3f} m" if "ate_m" in component else ""

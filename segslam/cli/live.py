@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from segslam.output.foxglove_server import FoxgloveServer
     from segslam.output.viewer import Scene
     from segslam.run.live.front import Front
-    from segslam.run.live.live_map import LiveMap, Show
+    from segslam.run.live.live_map import Show
     from segslam.run.live.ros import MappingPublisher
     from segslam.run.live.serve import Placed
     from segslam.run.live.waiting import Source
@@ -77,7 +77,6 @@ def live(
     configs = live_configs(preset, output)
     from segslam.labels.label_files import unlabelled
     from segslam.run.live.front import Front
-    from segslam.run.live.live_map import LiveMap
     from segslam.run.run import Run
     from segslam.slam.slam import Slam
 
@@ -111,8 +110,7 @@ def live(
         mirror = server.send if server else None
         run = stack.enter_context(Run(out, slam, dataset=source.name, options=recorded, mirror=mirror))
         publisher = _publisher(run, stack) if folder is None else None
-        with LiveMap(_shows(server, publisher)) as live_map:
-            figures = _follow(front, run, terminal, scene=scene, live_map=live_map, publisher=publisher)
+        figures = _follow(front, run, terminal, scene=scene, server=server, publisher=publisher)
         ended = front.ended
         if run.num_steps == 0:
             raise SegslamError(f"{source.name}: no scan was mapped{f' ({ended.why})' if ended.why else ''}")
@@ -148,15 +146,21 @@ def _follow(
     terminal: Terminal,
     *,
     scene: "Scene | None",
-    live_map: "LiveMap",
+    server: "FoxgloveServer | None",
     publisher: "MappingPublisher | None",
 ) -> "LiveFigures":
     """Close the loops of each scan with a pose, log it and pass it to all displays."""
     from segslam.core.types import Step
+    from segslam.run.live.live_map import LiveMap
 
     figures = LiveFigures(front)
     shown = monotonic()
-    with _status(terminal) as (show, every_s):
+    shows: list[Show] = []
+    if server:
+        shows.append(lambda drawn: server.send_map(drawn.points, drawn.labels, drawn.stamp_ns))
+    if publisher:
+        shows.append(publisher.show_map)
+    with LiveMap(shows) as live_map, _status(terminal) as (show, every_s):
         for placed in front:
             tries_loops = front.num_keyframes_waiting < MOST_BEHIND
             step = run.follow(placed.tracked, tries_loops=tries_loops)
@@ -174,16 +178,6 @@ def _follow(
                 shown = monotonic()
                 show(figures.line())
     return figures
-
-
-def _shows(server: "FoxgloveServer | None", publisher: "MappingPublisher | None") -> "list[Show]":
-    """Functions that display an updated map."""
-    shows: list[Show] = []
-    if server:
-        shows.append(lambda drawn: server.send_map(drawn.points, drawn.labels, drawn.stamp_ns))
-    if publisher:
-        shows.append(publisher.show_map)
-    return shows
 
 
 def _check_source(folder: Path | None, topic: str | None, fixes: str | None, out: Path) -> None:

@@ -12,7 +12,7 @@ from segslam.cli import completion
 from segslam.cli.checks import check_exists, check_free, check_own, check_run
 from segslam.cli.console import Terminal, print_json
 from segslam.cli.options import OverwriteOption
-from segslam.cli.tables import TableFiles, as_text, figure, with_meaning
+from segslam.cli.tables import TableFiles, as_text, with_meanings
 from segslam.core.errors import SegslamError, WorkFailed
 from segslam.core.interrupts import when_stopped
 
@@ -39,7 +39,7 @@ def compare(
     names = _names(runs)
     check_free([plot, tables.csv, tables.latex], overwrite=overwrite)
     terminal.announce(f"compare: reading {len(runs)} runs")
-    from segslam.output.finished import read_metrics, read_run
+    from segslam.output.finished import FIGURES, read_metrics, read_run
     from segslam.output.report.comparison import check_picture, draw_runs
 
     if plot is not None:
@@ -50,7 +50,9 @@ def compare(
     if terminal.json:
         print_json({"runs": figures, "plot": None if plot is None else str(plot)})
         return
-    print(_table(figures), flush=True)
+    width = max(14, *(len(name) + 2 for name in figures))
+    print("".join(f"{name:>{width}}" for name in figures))
+    print(with_meanings(list(figures.values()), FIGURES, width=width), flush=True)
     if plot is not None:
         terminal.say(f"figure written to {plot}")
 
@@ -61,20 +63,6 @@ def _names(runs: list[Path]) -> list[str]:
         raise SegslamError("compare: give two or more different runs")
     short = [folder.resolve().name for folder in runs]
     return short if len(set(short)) == len(runs) else [str(folder) for folder in runs]
-
-
-def _table(figures: dict[str, dict[str, Any]]) -> str:
-    """A row for each figure of any run, and a column for each run; `-` for missing figures. Meanings are wrapped."""
-    from segslam.output.finished import FIGURES
-
-    width = max(14, *(len(name) + 2 for name in figures))
-    lines = ["".join(f"{name:>{width}}" for name in figures)]
-    for key, meaning in FIGURES.items():
-        values = [run.get(key) for run in figures.values()]
-        if any(value is not None for value in values):
-            cells = ("-" if value is None else figure(value) for value in values)
-            lines.append(with_meaning("".join(f"{cell:>{width}}" for cell in cells), meaning))
-    return "\n".join(lines)
 
 
 def sweep(

@@ -9,7 +9,7 @@ import typer
 from segslam.cli.checks import check_free, check_links
 from segslam.cli.console import Terminal
 from segslam.cli.options import OverwriteOption
-from segslam.cli.tables import TableFiles, as_text, figure, with_meaning
+from segslam.cli.tables import TableFiles, as_text, with_meanings
 from segslam.core.errors import SegslamError
 
 
@@ -89,20 +89,13 @@ def evaluate(
     else:
         raise SegslamError("give either a run folder, or two files with --estimate and --reference")
     tables.write(rows)
-    terminal.table(figures, as_text(rows) if "drives" in figures else _table(figures))
-    if plot is not None and not terminal.json:
-        terminal.say(f"figure written to {plot}")
-
-
-def _table(figures: dict[str, Any]) -> str:
-    """The figures with their meaning, one per line."""
     from segslam.output.accuracy import MEANINGS
     from segslam.output.finished import FIGURES
 
     meanings = {"ate_m": FIGURES["ate_m"]} | MEANINGS | FIGURES
-    return "\n".join(
-        with_meaning(f"{figure(figures[key]):>10}", meaning) for key, meaning in meanings.items() if key in figures
-    )
+    terminal.table(figures, as_text(rows) if "drives" in figures else with_meanings([figures], meanings))
+    if plot is not None and not terminal.json:
+        terminal.say(f"figure written to {plot}")
 
 
 def _score_run(

@@ -4,7 +4,7 @@ import csv
 import io
 import shutil
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -31,16 +31,20 @@ Rows = Mapping[str, Mapping[str, Any]]
 """Name -> figures."""
 
 
-def figure(value: float) -> str:
-    """Whole numbers in full, others with four digits."""
-    return str(value) if isinstance(value, int) else f"{value:.4g}"
+def with_meanings(columns: Sequence[Mapping[str, Any]], meanings: Mapping[str, str], *, width: int = 10) -> str:
+    """A line for each figure of any column: whole numbers in full, others with four digits, `-` for missing ones.
 
-
-def with_meaning(cells: str, meaning: str) -> str:
-    """Figures and, beside them, their meaning, wrapped to the width of the terminal."""
-    indent = " " * (len(cells) + 2)
-    width = max(shutil.get_terminal_size().columns, len(indent) + 16)  # on a narrow terminal, too
-    return textwrap.fill(meaning, width, initial_indent=f"{cells}  ", subsequent_indent=indent)
+    The meaning beside them is wrapped to the width of the terminal.
+    """
+    lines = []
+    for key, meaning in meanings.items():
+        values = [column.get(key) for column in columns]
+        if any(value is not None for value in values):
+            shown = ("-" if one is None else str(one) if isinstance(one, int) else f"{one:.4g}" for one in values)
+            cells = "".join(f"{cell:>{width}}" for cell in shown) + "  "
+            fits = max(shutil.get_terminal_size().columns, len(cells) + 16)  # on a narrow terminal, too
+            lines.append(textwrap.fill(meaning, fits, initial_indent=cells, subsequent_indent=" " * len(cells)))
+    return "\n".join(lines)
 
 
 @dataclass(frozen=True)

@@ -84,24 +84,19 @@ def as_latex(rows: Rows) -> str:
     return "\n".join([*parts, ""])
 
 
-def as_text(rows: Rows, *, within: int | None = None) -> str:
-    """The columns of `SHORT`, aligned; those that do not fit `within` characters (of the terminal) follow below."""
-    within = within or shutil.get_terminal_size().columns
+def as_text(rows: Rows) -> str:
+    """The columns of `SHORT`, aligned; those that do not fit the terminal follow below."""
+    within = shutil.get_terminal_size().columns
     first = max(map(len, rows), default=4)
-    parts: list[list[tuple[str, int]]] = [[]]
+    names = [f"{name:<{first}}" for name in ("", *rows)]
+    parts = [names]
     for key in _columns(rows):
         width = max(len(SHORT[key]), 7)
-        if parts[-1] and first + sum(2 + w for _, w in parts[-1]) + 2 + width > within:
-            parts.append([])
-        parts[-1].append((key, width))
-    return "\n\n".join(_aligned(rows, columns, first) for columns in parts)
-
-
-def _aligned(rows: Rows, columns: list[tuple[str, int]], first: int) -> str:
-    lines = [" " * first + "".join(f"  {SHORT[key]:>{width}}" for key, width in columns)]
-    for name, row in rows.items():
-        lines.append(f"{name:<{first}}" + "".join(f"  {_cell(row.get(key)):>{width}}" for key, width in columns))
-    return "\n".join(lines)
+        if parts[-1] is not names and len(parts[-1][0]) + 2 + width > within:
+            parts.append(names)
+        cells = (SHORT[key], *(_cell(row.get(key)) for row in rows.values()))
+        parts[-1] = [f"{line}  {cell:>{width}}" for line, cell in zip(parts[-1], cells, strict=True)]
+    return "\n\n".join("\n".join(lines) for lines in parts)
 
 
 def _columns(rows: Rows) -> list[str]:

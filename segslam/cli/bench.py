@@ -25,7 +25,6 @@ from segslam.cli.options import (
 )
 from segslam.core.errors import SegslamError
 from segslam.core.interrupts import EXIT_STATUS, when_stopped
-from segslam.core.whole_files import check_target
 
 if TYPE_CHECKING:
     from segslam.bench.experiments.job import Job
@@ -198,8 +197,6 @@ def _make_job(data: Path, options: Options, changes: Settings, terminal: Termina
     from segslam.bench.experiments.methods import find_method
     from segslam.scans import DataSource
 
-    if options.details is not None:
-        check_target(options.details)
     if options.draw and options.out is None:
         raise SegslamError("--draw: pictures need a folder; give --out DIR")
     chosen = []

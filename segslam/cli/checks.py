@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 from segslam.cli.console import Terminal
 from segslam.cli.options import Settings
 from segslam.core.errors import SegslamError
+from segslam.core.whole_files import check_target
 
 if TYPE_CHECKING:
     from segslam.core.config import Config
@@ -28,9 +29,13 @@ def check_run(run: Path) -> None:
 
 
 def check_free(files: Iterable[Path | None], *, overwrite: bool) -> None:
-    """Raises SegslamError if one of the files to write exists, unless `overwrite` is set; a grid (.yaml) has two."""
+    """Raises SegslamError if one of the files to write exists, unless `overwrite` is set, or cannot be written.
+
+    A grid (.yaml) has two files.
+    """
     given = [file for file in files if file is not None]
     for file in (*given, *(file.with_suffix(".pgm") for file in given if file.suffix.lower() == ".yaml")):
+        check_target(file)
         if file.is_file() and not overwrite:
             raise SegslamError(f"{file}: exists; give another name, or replace it with --overwrite")
 

@@ -92,7 +92,6 @@ def sweep(
     """
     check_run(run)
     grid = grid_of(settings)
-    check_free([tables.csv, tables.latex], overwrite=overwrite)
     check_own(out, SOURCE, "*=*")
     terminal.announce(f"sweep: reading {run}")
     from segslam.output.folder import log_of
@@ -104,6 +103,7 @@ def sweep(
     for changes in grid.values():  # reports a wrong setting before anything is replayed
         changed_config(recorded, settings=changes)
     out.mkdir(parents=True, exist_ok=True)
+    check_free([tables.csv, tables.latex], overwrite=overwrite)  # which may be in this folder
     log, note = log_of(run), out / SOURCE
     source = f"{log.resolve()} of {log.stat().st_mtime_ns} ns\n"
     if note.is_file() and note.read_text(encoding="utf-8") != source:

@@ -10,7 +10,7 @@ from segslam.cli.checks import check_free
 from segslam.cli.console import Terminal
 from segslam.cli.options import OverwriteOption
 from segslam.core.errors import SegslamError
-from segslam.core.whole_files import check_target, whole_file
+from segslam.core.whole_files import whole_file
 
 if TYPE_CHECKING:
     from segslam.graph.batch import Optimized
@@ -38,7 +38,6 @@ def optimize(
 
     Example: segslam optimize parking-garage.g2o --out optimum.g2o
     """
-    check_target(out)
     check_free([out], overwrite=overwrite or force)
     terminal.announce(f"optimize: reading {graph}")
     from segslam.graph.batch import optimize_graph

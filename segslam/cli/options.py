@@ -13,7 +13,6 @@ from typer.models import OptionInfo
 
 from segslam.cli import completion
 from segslam.core.errors import SegslamError
-from segslam.core.whole_files import check_target
 
 if TYPE_CHECKING:
     from segslam.core.config import Config
@@ -134,7 +133,7 @@ class RunOutput(RunSettings):
     foxglove: FoxgloveOption = None
 
     def maps(self, folder: Path) -> tuple[list[Path], list[Path]]:
-        """Map files as given, and as paths in the run folder. Raises SegslamError if one cannot be written."""
+        """Map files as given, and as paths in the run folder. Raises SegslamError for an unknown kind of map."""
         names = [*map(Path, WITH_MAP if self.with_map else ()), *(self.map_file or ())]
         if not names:
             return [], []
@@ -142,9 +141,6 @@ class RunOutput(RunSettings):
 
         files = [folder / name for name in names]
         check_names(files)
-        for file in files:
-            if folder not in file.parents:
-                check_target(file)
         return names, files
 
 

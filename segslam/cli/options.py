@@ -179,7 +179,7 @@ class RunOptions(ScanOptions):
 
 @dataclass(frozen=True)
 class GnssOptions:
-    """Position fixes and their use."""
+    """Position fixes and their use. Raises SegslamError for a wrong one."""
 
     gnss: Annotated[
         str | None,
@@ -193,14 +193,19 @@ class GnssOptions:
     ] = "fuse"
     gnss_offset: Annotated[float, typer.Option(help="Seconds to add to the times of the fixes.")] = 0.0
 
+    def __post_init__(self) -> None:
+        if self.gnss is not None and not abs(self.gnss_offset) < MOST_OFFSET_S:
+            raise SegslamError(f"--gnss-offset {self.gnss_offset}: not a difference of clocks in seconds")
+        if self.gnss is not None and self.gnss_use not in GNSS_USES:
+            raise SegslamError(f"--gnss-use {self.gnss_use}: unknown; known: {', '.join(GNSS_USES)}")
+
     def placing(self, recording: Path | None = None) -> Callable[[Path], str] | None:
         """Reads the fixes; returns what georeferences a run folder with them and tells the result. None without fixes.
 
-        `recording`: where a topic is read. Raises SegslamError for a wrong option, or fixes that cannot be read.
+        `recording`: where a topic is read. Raises SegslamError for fixes that cannot be read.
         """
         if self.gnss is None:
             return None
-        self._check()
         from segslam.gnss.reading import read_fixes
         from segslam.output.georeferenced import georeference, summary
 
@@ -210,11 +215,10 @@ class GnssOptions:
     def placing_live(self, stack: ExitStack) -> Callable[[Path], str] | None:
         """Listens to a ROS 2 topic until `stack` ends; returns what georeferences a run with the fixes that arrived.
 
-        None without a topic. Raises SegslamError for a wrong option.
+        None without a topic.
         """
         if self.gnss is None:
             return None
-        self._check()
         from segslam.output.georeferenced import georeference_if_possible
         from segslam.run.live.ros import FixTopic
 
@@ -222,12 +226,6 @@ class GnssOptions:
         return lambda folder: georeference_if_possible(
             folder, name, topic.rows.copy(), use=self.gnss_use, offset_s=self.gnss_offset
         )
-
-    def _check(self) -> None:
-        if not abs(self.gnss_offset) < MOST_OFFSET_S:
-            raise SegslamError(f"--gnss-offset {self.gnss_offset}: not a difference of clocks in seconds")
-        if self.gnss_use not in GNSS_USES:
-            raise SegslamError(f"--gnss-use {self.gnss_use}: unknown; known: {', '.join(GNSS_USES)}")
 
     def recorded(self) -> dict[str, str]:
         """The options as the log of a run keeps them, for `resume`."""
@@ -239,7 +237,7 @@ class GnssOptions:
 
     @classmethod
     def of(cls, recorded: Mapping[str, str]) -> "GnssOptions":
-        """The options from the log of a run. Raises SegslamError for a damaged offset."""
+        """The options from the log of a run. Raises SegslamError if they are damaged."""
         try:
             offset_s = float(recorded.get("gnss_offset") or 0.0)
         except ValueError as error:

@@ -285,26 +285,26 @@ def _map_scans(
             file.parent.mkdir(parents=True, exist_ok=True)
         when_stopped(f"the log in {folder} is kept; {go_on}")
         stack.enter_context(how_to_go_on(f"{go_on} when there is space"))
-        apart = OdometryApart(settings.odometry, keeps_alone=True) if odometry is None else nullcontext(odometry)
-        run = stack.enter_context(
-            begun(
-                scans,
-                folder,
-                settings,
-                odometry=stack.enter_context(apart),
-                slam_of=slam_of or Slam,
-                options=options,
-                resumes=recorded is not None,
-                mirror=server.send if server else None,
-            )
-        )
 
         def watched(steps: "Iterator[Step | BadScan]", total: int, title: str) -> bool:
             """Shows each step and progress; True if Ctrl-C ended it early."""
             shown = terminal.progress(steps, total, title)
             return is_interrupted(map(scene.add, shown) if scene else shown)
 
-        with apart:
+        apart = OdometryApart(settings.odometry, keeps_alone=True) if odometry is None else nullcontext(odometry)
+        with apart as used:
+            run = stack.enter_context(
+                begun(
+                    scans,
+                    folder,
+                    settings,
+                    odometry=used,
+                    slam_of=slam_of or Slam,
+                    options=options,
+                    resumes=recorded is not None,
+                    mirror=server.send if server else None,
+                )
+            )
             if recorded is not None and watched(run.resume(recorded, scans), recorded.num_steps(), "resume"):
                 raise typer.Exit(EXIT_STATUS)  # the log is as before
             left = len(scans) - run.num_scans_resumed - run.num_scans_skipped

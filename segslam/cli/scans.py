@@ -121,12 +121,7 @@ def calibrate(
         if calibrator.travel_m > distance_m:
             break
     found, applied_deg = calibrator.vertical_angle(), opened.vertical_angle_deg
-    terminal.answer(_figures(found, applied_deg), _summary(found, applied_deg, calibrator.travel_m))
-
-
-def _figures(found: "VerticalAngle | None", applied_deg: float) -> dict[str, Any]:
-    """The figures; null if the angle is unknown."""
-    return {
+    figures = {
         "vertical_deg": found.angle_deg if found else None,
         "sigma_deg": found.sigma_deg if found else None,
         "num_pairs": found.num_pairs if found else 0,
@@ -134,6 +129,7 @@ def _figures(found: "VerticalAngle | None", applied_deg: float) -> dict[str, Any
         "applied_deg": applied_deg,
         "set_deg": applied_deg + found.angle_deg if found else None,
     }
+    terminal.answer(figures, _summary(found, applied_deg, calibrator.travel_m))
 
 
 def _summary(found: "VerticalAngle | None", applied_deg: float, travel_m: float) -> str:

@@ -1,6 +1,6 @@
 """`segslam locate` and `register`: poses of single scans, in a map or in another scan."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -20,9 +20,11 @@ if TYPE_CHECKING:
     from segslam.bench.experiments.baselines import Estimate
     from segslam.core.config import Config
     from segslam.core.threads import Stopwatch
-    from segslam.core.types import Labels, Points, Rejected, Scan, ScanLabels
-    from segslam.labels.label_files import LabelSource
+    from segslam.core.types import Labels, Points, Rejected, Scan, ScanLabels, Vector
     from segslam.run.locator import Located
+
+    LabelsOf = Callable[[str, Points, Vector | None], ScanLabels]
+    """Labels of a scan, given its name, points and intensities."""
 
 LABEL_WORDS = ("geometric", "none")
 NOT_FOUND: dict[str, Any] = {"found": False} | dict.fromkeys(
@@ -47,26 +49,18 @@ class ScanFileOptions:
                 f"--dataset {self.dataset}: only kitti needs a correction; omit the option for other data"
             )
 
-    def read(self, file: Path, labels: "Path | LabelSource", label_files: Sequence[Path], config: "Config") -> "Scan":
-        """The usable points of a file, corrected, with labels of a source, or of a file numbered as all `label_files`.
-
-        Raises SegslamError, naming the file, if one cannot be read.
-        """
-        from segslam.labels.label_files import encoding_of, read_labels
+    def read(self, file: Path, labels_of: "LabelsOf", config: "Config") -> "Scan":
+        """The usable points of a file, corrected, and their labels. Raises SegslamError, naming the file, if bad."""
         from segslam.scans.clouds import read_file
         from segslam.scans.dataset import make_scan
         from segslam.scans.kitti import VERTICAL_ANGLE_DEG
 
         cloud = read_file(file)
-        classes: ScanLabels
-        if isinstance(labels, Path):
-            classes = read_labels(labels, len(cloud.points), self.encoding or encoding_of(label_files))
-        else:
-            classes = labels.read(file.stem, cloud.points, cloud.intensities)
+        labels = labels_of(file.stem, cloud.points, cloud.intensities)
         angle_deg = config.sensor.vertical_angle_deg
         if angle_deg is None:
             angle_deg = VERTICAL_ANGLE_DEG if self.dataset == "kitti" else 0.0
-        return make_scan(file, 0, 0, cloud.points, classes, vertical_angle_deg=angle_deg)
+        return make_scan(file, 0, 0, cloud.points, labels, vertical_angle_deg=angle_deg)
 
 
 class LabelsCommand(TyperCommand):
@@ -108,19 +102,21 @@ def locate(
     for file in label_files:
         check_exists(file, "--labels: give geometric, none, or a folder with a .label file for each scan")
     terminal.announce(f"locate: reading {run}")
-    from segslam.labels.label_files import LabelSource, computed
+    from segslam.labels.label_files import LabelSource, computed, encoding_of
     from segslam.run.locator import Locator
 
     files.check()
+    source = LabelSource(labels == "geometric")
+    if label_files:
+        source = LabelSource(False, Path(labels), files.encoding or encoding_of(label_files))
     locator = Locator.from_run(run)
     terminal.compile_kernels()
     num_bad = 0
     found = []
-    sources: Sequence[Path | LabelSource] = label_files or len(scans) * [LabelSource(labels == "geometric")]
-    for scan, source in terminal.progress(list(zip(scans, sources, strict=True)), len(scans), "locate"):
+    for scan in terminal.progress(scans, len(scans), "locate"):
         started = perf_counter()
         try:
-            ready = files.read(scan, source, label_files, locator.config)
+            ready = files.read(scan, source.read, locator.config)
             classes = None if labels == "geometric" else computed(ready.labels)
         except SegslamError as error:
             num_bad += 1
@@ -177,7 +173,7 @@ def register(
     chosen = find_method(method)
     terminal.compile_kernels()
     watch = Stopwatch()
-    clouds = _read_two((source, target), labels or ["geometric"], files, settings, watch)
+    clouds = _read_two(source, target, labels or ["geometric"], files, settings, watch)
     scans: list[dict[str, Any]] = []
     for name, (points, classes) in zip(("source", "target"), clouds, strict=True):
         with watch(f"describe_{name}"):
@@ -194,22 +190,30 @@ def register(
 
 
 def _read_two(
-    both: tuple[Path, Path], words: list[str], files: ScanFileOptions, config: "Config", watch: "Stopwatch"
+    source: Path, target: Path, words: list[str], files: ScanFileOptions, config: "Config", watch: "Stopwatch"
 ) -> list[tuple["Points", "Labels"]]:
     """Points and labels of the two scans."""
     from segslam.labels import geometric_labels
-    from segslam.labels.label_files import computed, open_labels
+    from segslam.labels.label_files import computed, encoding_of, open_labels, read_labels
 
     files.check()
-    label_files = [Path(word) for word in words] if len(words) == 2 else []
-    sources: Sequence[Path | LabelSource] = label_files
-    if _is_word(words[0]) and not label_files:
-        sources = 2 * [open_labels(words[0], beside=both[0].parent, scan_names=(), encoding=None)]
-    elif not label_files:
+    both = (source, target)
+    if len(words) == 2:
+        label_files = [Path(word) for word in words]
+        numbering = files.encoding or encoding_of(label_files)
+
+        def of_file(file: Path) -> "LabelsOf":
+            return lambda _, points, __: read_labels(file, len(points), numbering)
+
+        sources = [of_file(file) for file in label_files]
+    elif _is_word(words[0]):
+        of_both: LabelsOf = open_labels(words[0], beside=source.parent, scan_names=(), encoding=None).read
+        sources = [of_both, of_both]
+    else:
         raise SegslamError(
             f"--labels {words[0]}: give two .label files, source and target, or geometric, or network:MODEL"
         )
-    scans = [files.read(file, labels, label_files, config) for file, labels in zip(both, sources, strict=True)]
+    scans = [files.read(file, labels_of, config) for file, labels_of in zip(both, sources, strict=True)]
     with watch("label"):
         return [
             (scan.points, geometric_labels(scan.points) if words[0] == "geometric" else computed(scan.labels))

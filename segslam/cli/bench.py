@@ -11,7 +11,7 @@ import typer
 
 from segslam.bench.experiments.method_settings import METHOD_NAMES
 from segslam.cli.checks import check_free, check_own
-from segslam.cli.completion import one_of
+from segslam.cli.commands import GroupedCommands
 from segslam.cli.console import Terminal
 from segslam.cli.ending import is_interrupted
 from segslam.cli.options import (
@@ -25,7 +25,6 @@ from segslam.cli.options import (
 )
 from segslam.core.errors import SegslamError
 from segslam.core.interrupts import EXIT_STATUS, when_stopped
-from segslam.core.whole_files import check_target
 
 if TYPE_CHECKING:
     from segslam.bench.experiments.job import Job
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from segslam.core.types import Trajectory
 
 app = typer.Typer(
+    cls=GroupedCommands,
     help="Repeat the experiments of the Segregator paper; every method gets the same scans.\n\n"
     "Example: segslam bench pairs kitti --sequence 06 --pairs kitti06_3to5.txt --sample 100 --out bench06",
     no_args_is_help=True,
@@ -50,51 +50,38 @@ class Options:
 
     pairs: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--pairs", help="List of pairs: one `source target` per line, or JSON with their poses; may be repeated."
-        ),
+        typer.Option(help="List of pairs: one `source target` per line, or JSON with their poses; may be repeated."),
     ] = None
     min_m: Annotated[
-        float | None,
-        typer.Option("--min-m", min=0, help="Make a list from the true poses: smallest distance of a pair (m)."),
+        float | None, typer.Option(min=0, help="Make a list from the true poses: smallest distance of a pair (m).")
     ] = None
-    max_m: Annotated[float | None, typer.Option("--max-m", min=0, help="Largest distance of such a pair (m).")] = None
-    min_gap: Annotated[
-        int, typer.Option("--min-gap", min=1, help="Smallest number of scans between the two of such a pair.")
-    ] = 50
-    sample: Annotated[
-        int | None, typer.Option("--sample", min=1, help="Use only N pairs of each list, drawn at random.")
-    ] = None
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed of --sample.")] = 0
+    max_m: Annotated[float | None, typer.Option(min=0, help="Largest distance of such a pair (m).")] = None
+    min_gap: Annotated[int, typer.Option(min=1, help="Smallest number of scans between the two of such a pair.")] = 50
+    sample: Annotated[int | None, typer.Option(min=1, help="Use only N pairs of each list, drawn at random.")] = None
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of --sample.")] = 0
     sequence: SequenceOption = "00"
     method: Annotated[
         list[str] | None,
         typer.Option(
-            "--method",
-            autocompletion=one_of(*METHOD_NAMES),
+            autocompletion=lambda: METHOD_NAMES,
             help=f"Method, may be repeated; default: all of {', '.join(METHOD_NAMES)}.",
         ),
     ] = None
     dataset: DatasetOption = None
     labels: LabelsOption = "auto"
     encoding: EncodingOption = None
-    workers: Annotated[
-        int, typer.Option("--workers", min=1, help="Number of processes on this machine (extra `cluster`).")
-    ] = 1
+    workers: Annotated[int, typer.Option(min=1, help="Number of processes on this machine (extra `cluster`).")] = 1
     scheduler: Annotated[
-        str | None, typer.Option("--scheduler", help="Address of a Dask cluster with access to DATA (extra `cluster`).")
+        str | None, typer.Option(help="Address of a Dask cluster with access to DATA (extra `cluster`).")
     ] = None
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out",
-            help="Folder for the report and the rows; the same command continues an interrupted benchmark there.",
+            help="Folder for the report and the rows; the same command continues an interrupted benchmark there."
         ),
     ] = None
-    details: Annotated[Path | None, typer.Option("--details", help="CSV file to write, one row per registration.")] = (
-        None
-    )
-    draw: Annotated[int, typer.Option("--draw", min=0, help="Draw the N worst failures; needs --out.")] = 0
+    details: Annotated[Path | None, typer.Option(help="CSV file to write, one row per registration.")] = None
+    draw: Annotated[int, typer.Option(min=0, help="Draw the N worst failures; needs --out.")] = 0
     overwrite: OverwriteOption = False
 
 
@@ -125,9 +112,7 @@ def yaw(
     *,
     options: Options,
     changes: Settings,
-    step_deg: Annotated[
-        float, typer.Option("--step-deg", min=1, max=180, help="Step between two yaw angles (degrees).")
-    ] = 15.0,
+    step_deg: Annotated[float, typer.Option(min=1, max=180, help="Step between two yaw angles (degrees).")] = 15.0,
     terminal: Terminal,
 ) -> None:
     """Measure the error against the yaw of the source, over the full circle. Default pair: scans 0 and 10.
@@ -151,7 +136,7 @@ def deterioration(
     clouds: Annotated[
         Literal["one", "both"], typer.Option(help="Remove labels from the source only, or from both scans.")
     ] = "both",
-    draws: Annotated[int, typer.Option("--draws", min=1, help="Number of random draws at each percentage.")] = 10,
+    draws: Annotated[int, typer.Option(min=1, help="Number of random draws at each percentage.")] = 10,
     terminal: Terminal,
 ) -> None:
     """Measure the success while labels are removed at random. Default pair: scans 0 and 10.
@@ -170,10 +155,10 @@ def places(
         Path, typer.Argument(help="Places: a .npz with `columns` (n, size, size) uint8 and `poses` (n, 3, 4).")
     ],
     *,
-    database: Annotated[str, typer.Option("--database", help="Rows of the database: A:B, B excluded.")],
-    queries: Annotated[str, typer.Option("--queries", help="Rows of the queries: C:D.")],
-    turned: Annotated[bool, typer.Option("--turned", help="Rotate each query by a random yaw.")] = False,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed of --turned.")] = 0,
+    database: Annotated[str, typer.Option(help="Rows of the database: A:B, B excluded.")],
+    queries: Annotated[str, typer.Option(help="Rows of the queries: C:D.")],
+    turned: Annotated[bool, typer.Option(help="Rotate each query by a random yaw.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of --turned.")] = 0,
     terminal: Terminal,
 ) -> None:
     """Measure how often a place is recognised, without labels. A hit is within 5 m; queries without one are omitted.
@@ -212,8 +197,6 @@ def _make_job(data: Path, options: Options, changes: Settings, terminal: Termina
     from segslam.bench.experiments.methods import find_method
     from segslam.scans import DataSource
 
-    if options.details is not None:
-        check_target(options.details)
     if options.draw and options.out is None:
         raise SegslamError("--draw: pictures need a folder; give --out DIR")
     chosen = []
@@ -264,25 +247,6 @@ def _read_lists(
     return [sample_pairs(one, num_pairs=options.sample, seed=options.seed) for one in lists]
 
 
-def _run_trials(job: "Job", trials: list["Trial"], options: Options, terminal: Terminal) -> list["Row"]:
-    """All rows in the order of the trials. After Ctrl-C, finished rows remain in the folder of `--out`."""
-    from segslam.bench.experiments.benchmark import in_order, run
-    from segslam.bench.experiments.rows import write_rows
-
-    terminal.compile_kernels()
-    rows: list[Row] = []
-    kept = f"are kept in {options.out}; the same command continues" if options.out else "are lost; --out keeps them"
-    when_stopped(f"the finished registrations {kept}")
-    work = run(job, trials, workers=options.workers, scheduler=options.scheduler, folder=options.out)
-    if is_interrupted(map(rows.extend, terminal.progress(work, len(trials), "bench"))):
-        when_stopped(f"{len(rows)} registrations {kept}")
-        raise typer.Exit(EXIT_STATUS)
-    rows = in_order(rows, job, trials)
-    if options.details is not None:
-        write_rows(options.details, rows)
-    return rows
-
-
 def _experiment(
     name: str,
     data: Path,
@@ -300,17 +264,28 @@ def _experiment(
     report.
     """
     job = _make_job(data, options, changes, terminal)
+    from segslam.bench.experiments.benchmark import in_order, run
     from segslam.bench.experiments.job import open_once
     from segslam.bench.experiments.pairs import PAPER_PAIR, pair_trials
     from segslam.bench.experiments.paper import with_paper_values
     from segslam.bench.experiments.provenance import account
     from segslam.bench.experiments.report_tables import overall, plain
-    from segslam.bench.experiments.rows import results
+    from segslam.bench.experiments.rows import results, write_rows
 
     reference = open_once(job.source)[0].reference
     lists = _read_lists(options, reference, default=PAPER_PAIR if varied else None)
     trials = [trial for one in lists for trial in pair_trials(one, reference, **varied)]
-    rows = _run_trials(job, trials, options, terminal)
+    terminal.compile_kernels()
+    rows: list[Row] = []
+    kept = f"are kept in {options.out}; the same command continues" if options.out else "are lost; --out keeps them"
+    when_stopped(f"the finished registrations {kept}")
+    work = run(job, trials, workers=options.workers, scheduler=options.scheduler, folder=options.out)
+    if is_interrupted(map(rows.extend, terminal.progress(work, len(trials), "bench"))):
+        when_stopped(f"{len(rows)} registrations {kept}")
+        raise typer.Exit(EXIT_STATUS)
+    rows = in_order(rows, job, trials)
+    if options.details is not None:
+        write_rows(options.details, rows)
     found = with_paper_values(results(rows, by=by), experiment=name, sequence=options.sequence, lists=lists)
     if options.out is not None:
         from segslam.bench.experiments.report import write_bench_report

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 from segslam.cli.console import Terminal
 from segslam.cli.options import Settings
 from segslam.core.errors import SegslamError
+from segslam.core.whole_files import check_target
 
 if TYPE_CHECKING:
     from segslam.core.config import Config
@@ -28,9 +29,13 @@ def check_run(run: Path) -> None:
 
 
 def check_free(files: Iterable[Path | None], *, overwrite: bool) -> None:
-    """Raises SegslamError if one of the files to write exists, unless `overwrite` is set; a grid (.yaml) has two."""
+    """Raises SegslamError if one of the files to write exists, unless `overwrite` is set, or cannot be written.
+
+    A grid (.yaml) has two files.
+    """
     given = [file for file in files if file is not None]
     for file in (*given, *(file.with_suffix(".pgm") for file in given if file.suffix.lower() == ".yaml")):
+        check_target(file)
         if file.is_file() and not overwrite:
             raise SegslamError(f"{file}: exists; give another name, or replace it with --overwrite")
 
@@ -41,22 +46,23 @@ def check_own(folder: Path, *made_by: str) -> None:
         raise SegslamError(f"{folder}: not empty, and not made by this command; give another folder")
 
 
-def make_room(
+def make_folder(
     folder: Path,
     *,
     overwrite: bool,
     inputs: Iterable[Path | None] = (),
     made_by: tuple[str, ...] = ("log.mcap", "log.mcap.part"),
-) -> None:
-    """Remove an earlier run in the folder of a new one, if `overwrite` is set; otherwise leave all as it is.
+) -> Path:
+    """Create the folder of a new run, as `new_folder`; with `overwrite` an earlier run there is removed before.
 
     Raises SegslamError for a folder that is no run (it has none of the files `made_by`), for a run in progress, and if
     the new run is made from files in it.
     """
+    from segslam.output.folder import new_folder
     from segslam.output.log import is_being_written
 
     if not overwrite or not folder.is_dir() or not any(folder.iterdir()):
-        return
+        return new_folder(folder)
     logs = [folder / name for name in made_by if (folder / name).exists()]
     if not logs or folder.is_symlink():
         raise SegslamError(f"{folder}: not made by this command, so --overwrite does not remove it; give another --out")
@@ -67,6 +73,7 @@ def make_room(
     if any(log.is_file() and is_being_written(log) for log in logs):
         raise SegslamError(f"{folder}: the run is still in progress; stop it, or give another --out")
     shutil.rmtree(folder)
+    return new_folder(folder)
 
 
 def check_links(folder: Path) -> None:
@@ -148,11 +155,11 @@ def preset_config(name: str, scans: "Dataset", terminal: Terminal) -> "Config":
     """The settings of a preset; with `auto`, of the preset that fits the scans, with a message."""
     from segslam.scans.presets import extent_m, preset, preset_for
 
-    if name != "auto":
-        return preset(cast("Preset", name))
-    extent = extent_m(scans)
-    show_preset(preset_for(extent), extent, terminal)
-    return preset(preset_for(extent))
+    if name == "auto":
+        extent = extent_m(scans)
+        name = preset_for(extent)
+        show_preset(name, extent, terminal)
+    return preset(cast("Preset", name))
 
 
 def live_configs(name: str, output: Settings) -> "dict[Preset, Config]":

@@ -1,11 +1,10 @@
-"""All commands in groups, and their help: aliases, and names of values instead of Python's types."""
+"""All commands in groups, and their help: aliases, and names of arguments without Python's types."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib import import_module
-from pathlib import Path
 from types import MappingProxyType
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import typer
 from typer.core import TyperGroup
@@ -57,7 +56,6 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
 CLASSES = {"register": "locate.LabelsCommand"}
 ALIASES = MappingProxyType({"localize": "localise", "optimise": "optimize"})
 """Other spellings of commands; the help does not list them."""
-VALUE_NAMES: Mapping[type, str] = MappingProxyType({Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"})
 
 
 def add(app: typer.Typer, words: Sequence[str] = ()) -> None:
@@ -90,10 +88,14 @@ class GroupedCommands(TyperGroup):
     """Commands under the heading `rich_help_panel` in the help, in the order in which they were added."""
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """The command of a name or alias."""
-        command = super().get_command(ctx, ALIASES.get(cmd_name, cmd_name))
-        if command is not None:
-            _name_values(command)
+        """The command of a name or alias; its help shows an argument as NAME, several as NAME..., without types."""
+        command: Any = super().get_command(ctx, ALIASES.get(cmd_name, cmd_name))
+        for argument in command.params if command else ():
+            if argument.param_type_name == "argument":
+                argument.metavar = argument.metavar or f"{argument.name.upper()}{'...' * (argument.nargs == -1)}"
+                argument.display_type = lambda ctx: ""
+                shown = argument.metavar if argument.required else f"[{argument.metavar}]"
+                argument.get_usage_pieces = lambda ctx, shown=shown: [shown]
         return command
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
@@ -103,35 +105,7 @@ class GroupedCommands(TyperGroup):
         for name in self.list_commands(ctx):
             command: Any = self.commands[name]
             about = command.get_short_help_str(formatter.width - 6 - width)
-            groups[command.rich_help_panel].append((f"{name:{width}}", about))
+            groups[command.rich_help_panel or "Commands"].append((f"{name:{width}}", about))
         for title, rows in groups.items():
             with formatter.section(title):
                 formatter.write_dl(rows)
-
-
-def _name_values(command: Any) -> None:
-    """Set the names of values in the help of a command where it has none, also for subcommands."""
-    for child in getattr(command, "commands", {}).values():
-        _name_values(child)
-    hints = get_type_hints(command.callback) if command.callback else {}
-    for parameter in command.params:
-        if parameter.param_type_name == "argument":
-            _name_argument(parameter)
-        elif parameter.metavar is None:
-            parameter.metavar = _value_name(hints.get(parameter.name))
-
-
-def _name_argument(argument: Any) -> None:
-    """An argument is shown as NAME, several as NAME..., optional ones as [NAME]; without their types."""
-    argument.metavar = argument.metavar or f"{argument.name.upper()}{'...' * (argument.nargs == -1)}"
-    shown = argument.metavar if argument.required else f"[{argument.metavar}]"
-    argument.display_type = lambda ctx: ""
-    argument.get_usage_pieces = lambda ctx: [shown]
-
-
-def _value_name(hint: Any) -> str | None:
-    """PATH, TEXT, N or NUMBER, also for lists and optional values; None for flags and choices."""
-    if hint in VALUE_NAMES:
-        return VALUE_NAMES[hint]
-    names = [_value_name(one) for one in get_args(hint) if isinstance(one, type) or get_args(one)]
-    return next((name for name in names if name), None)

@@ -10,14 +10,14 @@ import typer
 
 from segslam.cli import completion
 from segslam.cli.checks import check_exists, check_free, check_own, check_run
-from segslam.cli.console import Terminal, print_json, print_out
+from segslam.cli.console import Terminal, print_json
 from segslam.cli.options import OverwriteOption
-from segslam.cli.tables import TableFiles, as_text, figure, with_meaning
+from segslam.cli.tables import TableFiles, as_text, with_meanings
 from segslam.core.errors import SegslamError, WorkFailed
 from segslam.core.interrupts import when_stopped
 
 SOURCE = "replayed.txt"
-"""File in the folder of a sweep: the log that its runs replay."""
+"""File in the folder of a sweep: the log that its runs replay, and the time of its last change."""
 
 
 def compare(
@@ -39,7 +39,7 @@ def compare(
     names = _names(runs)
     check_free([plot, tables.csv, tables.latex], overwrite=overwrite)
     terminal.announce(f"compare: reading {len(runs)} runs")
-    from segslam.output.finished import read_metrics, read_run
+    from segslam.output.finished import FIGURES, read_metrics, read_run
     from segslam.output.report.comparison import check_picture, draw_runs
 
     if plot is not None:
@@ -50,7 +50,9 @@ def compare(
     if terminal.json:
         print_json({"runs": figures, "plot": None if plot is None else str(plot)})
         return
-    print_out(_table(figures))
+    width = max(14, *(len(name) + 2 for name in figures))
+    print("".join(f"{name:>{width}}" for name in figures))
+    print(with_meanings(list(figures.values()), FIGURES, width=width), flush=True)
     if plot is not None:
         terminal.say(f"figure written to {plot}")
 
@@ -61,20 +63,6 @@ def _names(runs: list[Path]) -> list[str]:
         raise SegslamError("compare: give two or more different runs")
     short = [folder.resolve().name for folder in runs]
     return short if len(set(short)) == len(runs) else [str(folder) for folder in runs]
-
-
-def _table(figures: dict[str, dict[str, Any]]) -> str:
-    """A row for each figure of any run, and a column for each run; `-` for missing figures. Meanings are wrapped."""
-    from segslam.output.finished import FIGURES
-
-    width = max(14, *(len(name) + 2 for name in figures))
-    lines = ["".join(f"{name:>{width}}" for name in figures)]
-    for key, meaning in FIGURES.items():
-        values = [run.get(key) for run in figures.values()]
-        if any(value is not None for value in values):
-            cells = ("-" if value is None else figure(value) for value in values)
-            lines.append(with_meaning("".join(f"{cell:>{width}}" for cell in cells), meaning))
-    return "\n".join(lines)
 
 
 def sweep(
@@ -104,7 +92,6 @@ def sweep(
     """
     check_run(run)
     grid = grid_of(settings)
-    check_free([tables.csv, tables.latex], overwrite=overwrite)
     check_own(out, SOURCE, "*=*")
     terminal.announce(f"sweep: reading {run}")
     from segslam.output.folder import log_of
@@ -116,9 +103,14 @@ def sweep(
     for changes in grid.values():  # reports a wrong setting before anything is replayed
         changed_config(recorded, settings=changes)
     out.mkdir(parents=True, exist_ok=True)
-    _check_same(log_of(run), out / SOURCE)
+    check_free([tables.csv, tables.latex], overwrite=overwrite)  # which may be in this folder
+    log, note = log_of(run), out / SOURCE
+    source = f"{log.resolve()} of {log.stat().st_mtime_ns} ns\n"
+    if note.is_file() and note.read_text(encoding="utf-8") != source:
+        raise SegslamError(f"{out}: has replays of another log; give another folder")
+    note.write_text(source, encoding="utf-8")
     when_stopped(f"what is done is kept in {out}; call the same command again to go on")
-    tasks = [(str(log_of(run).resolve()), str((out / name).resolve()), changes) for name, changes in grid.items()]
+    tasks = [(str(log.resolve()), str((out / name).resolve()), changes) for name, changes in grid.items()]
     rows: dict[str, dict[str, Any]] = {name: {} for name in grid}
     failures = []
     with started(out.resolve(), number=workers, scheduler=scheduler) as (work, _):
@@ -133,22 +125,15 @@ def sweep(
         raise WorkFailed("; ".join(failures))
 
 
-def _check_same(log: Path, note: Path) -> None:
-    """Note the log in a file. Raises SegslamError if another one, or another state of it, is noted there."""
-    text = f"{log.resolve()} of {log.stat().st_mtime_ns} ns\n"
-    if note.is_file() and note.read_text(encoding="utf-8") != text:
-        raise SegslamError(f"{note.parent}: has replays of another log; give another folder")
-    note.write_text(text, encoding="utf-8")
-
-
 def grid_of(settings: Sequence[str]) -> dict[str, list[str]]:
     """Name -> settings of each combination. Raises SegslamError for a text without values."""
     choices = []
     for text in settings:
-        key, _, values = text.partition("=")
+        key, _, listed = text.partition("=")
+        values = [value for value in listed.split(",") if value]
         if not key or not values:
             raise SegslamError(f"--set {text}: give values, as in --set verify.max_false_share=0.01,0.001")
-        choices.append([f"{key}={value}" for value in values.split(",") if value])
+        choices.append([f"{key}={value}" for value in values])
     return {" ".join(combination): list(combination) for combination in product(*choices)}
 
 

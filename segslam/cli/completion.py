@@ -1,48 +1,33 @@
-"""Completion of values in the shell; the modules that know them are imported when a value is completed."""
+"""Values offered by the shell, which typer filters by what is typed; modules that know them are imported only then."""
 
-from collections.abc import Callable, Iterable
+import os
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
-
-SENSORS = ("hdl64", "os1-64", "vlp16")
-
-
-def _starting(words: Iterable[str], incomplete: str) -> list[str]:
-    return [word for word in words if word.startswith(incomplete)]
-
-
-def one_of(*words: str) -> Callable[[str], list[str]]:
-    """A completion among fixed words."""
-
-    def complete(incomplete: str) -> list[str]:
-        return _starting(words, incomplete)
-
-    return complete
 
 
 def labels_or_files(incomplete: str) -> list[str]:
     """Sources of labels, and the paths that begin so: a completion of its own replaces the shell's file names."""
-    parent = Path(incomplete).expanduser()
-    parent = parent if incomplete.endswith("/") else parent.parent
+    folder = incomplete[: incomplete.rfind("/") + 1]
     try:
-        paths = [f"{path}/" if path.is_dir() else str(path) for path in parent.iterdir()]
+        paths = sorted(Path(os.path.expanduser(folder)).iterdir())
+        names = [f"{folder}{path.name}{'/' if path.is_dir() else ''}" for path in paths]
     except OSError:
-        paths = []
-    return _starting(["auto", "none", "geometric", "network:", *sorted(paths)], incomplete)
+        names = []
+    return ["auto", "none", "geometric", "network:", *names]
 
 
-def presets(incomplete: str) -> list[str]:
+def presets() -> list[str]:
     """Names of the presets."""
     from segslam.scans.presets import SETTINGS
 
-    return _starting(["auto", *SETTINGS], incomplete)
+    return ["auto", *SETTINGS]
 
 
-def datasets(incomplete: str) -> list[str]:
+def datasets() -> list[str]:
     """Kinds of data."""
     from segslam.scans.recordings import known_kinds
 
-    return _starting(known_kinds(), incomplete)
+    return known_kinds()
 
 
 def settings(incomplete: str) -> list[str]:
@@ -67,7 +52,7 @@ def _settings(config: Any, incomplete: str) -> list[str]:
     }
     key, equals, _ = incomplete.partition("=")
     if not equals:
-        return _starting(fields, incomplete)
+        return list(fields)
     hint = fields.get(f"{key}=")
     values = ("true", "false") if hint is bool else get_args(hint) if get_origin(hint) is Literal else ()
-    return _starting([f"{key}={value}" for value in values], incomplete)
+    return [f"{key}={value}" for value in values]

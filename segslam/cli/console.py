@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from segslam.core.errors import WorkFailed, reason
+from segslam.core.errors import WorkFailed
 
 logger = logging.getLogger(__name__)
 Item = TypeVar("Item")
@@ -55,8 +55,7 @@ class Terminal:
     """Options of nearly every command, and how it answers: results on standard output, all else on standard error."""
 
     json: Annotated[
-        bool,
-        typer.Option("--json", help="Print the figures as one JSON object on standard output, and nothing else there."),
+        bool, typer.Option(help="Print the figures as one JSON object on standard output, and nothing else there.")
     ] = False
     quiet: Annotated[
         bool,
@@ -90,7 +89,7 @@ class Terminal:
         if self.json:
             print_json(figures)
         elif not self.quiet:
-            print_out(text)
+            print(text, flush=True)
 
     def progress(self, items: Iterable[Item], total: int, title: str) -> Iterator[Item]:
         """Yield the items; show a bar on a terminal, or print a line every ten seconds; no output if quiet."""
@@ -120,19 +119,9 @@ class Terminal:
         return total
 
 
-def print_json(values: dict[str, Any]) -> None:
-    """Print one JSON object on standard output. Raises ValueError for NaN: callers must omit unknown figures."""
-    print_out(json_text.dumps(values, allow_nan=False))
-
-
-def print_out(text: str) -> None:
-    """Print lines on standard output. Raises WorkFailed on a write error, for example a full disk."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise WorkFailed(f"standard output: cannot be written ({reason(error)}); redirect it elsewhere") from error
+def print_json(values: dict[str, Any] | list[Any]) -> None:
+    """Print one JSON value on standard output. Raises ValueError for NaN: callers must omit unknown figures."""
+    print(json_text.dumps(values, allow_nan=False), flush=True)
 
 
 def say(text: str) -> None:

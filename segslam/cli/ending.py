@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from segslam.cli.console import Terminal, print_json
+from segslam.cli.console import Terminal
 
 if TYPE_CHECKING:
     from segslam.run.run import Run
@@ -55,13 +55,9 @@ def finish(
     metrics, placed = run.complete(
         more=more, place=place, map_files=map_files, search_s=search_s, progress=terminal.progress
     )
-    if terminal.json:
-        print_json(metrics)
-        return metrics
     written = map_summary(metrics, map_files) if map_files else ""
-    for text in (summary(metrics, run.folder), vertical_angle_advice(metrics, run.config.sensor), placed, written):
-        if text:
-            terminal.say(text)
+    texts = (summary(metrics, run.folder), vertical_angle_advice(metrics, run.config.sensor), placed, written)
+    terminal.answer(metrics, "\n".join(filter(None, texts)))
     return metrics
 
 

@@ -2,19 +2,15 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from segslam.cli.checks import check_free, check_links
 from segslam.cli.console import Terminal
 from segslam.cli.options import OverwriteOption
-from segslam.cli.tables import TableFiles, as_text, figure, with_meaning
+from segslam.cli.tables import TableFiles, as_text, with_meanings
 from segslam.core.errors import SegslamError
-
-if TYPE_CHECKING:
-    from segslam.core.evaluation import Up
-    from segslam.core.trajectory import Poses
 
 
 @dataclass(frozen=True)
@@ -70,6 +66,10 @@ def evaluate(
     segslam eval --estimate runs --reference kitti/poses --csv kitti.csv
     """
     check_free([plot, tables.csv, tables.latex], overwrite=overwrite)
+    if plot is not None:
+        from segslam.output.report.comparison import check_picture
+
+        check_picture(plot)
     if run is not None or estimate is not None:
         terminal.announce(f"eval: reading {run or estimate}")
     if run is not None and estimate is None:
@@ -89,20 +89,13 @@ def evaluate(
     else:
         raise SegslamError("give either a run folder, or two files with --estimate and --reference")
     tables.write(rows)
-    terminal.table(figures, as_text(rows) if "drives" in figures else _table(figures))
-    if plot is not None and not terminal.json:
-        terminal.say(f"figure written to {plot}")
-
-
-def _table(figures: dict[str, Any]) -> str:
-    """The figures with their meaning, one per line."""
     from segslam.output.accuracy import MEANINGS
     from segslam.output.finished import FIGURES
 
     meanings = {"ate_m": FIGURES["ate_m"]} | MEANINGS | FIGURES
-    return "\n".join(
-        with_meaning(f"{figure(figures[key]):>10}", meaning) for key, meaning in meanings.items() if key in figures
-    )
+    terminal.table(figures, as_text(rows) if "drives" in figures else with_meanings([figures], meanings))
+    if plot is not None and not terminal.json:
+        terminal.say(f"figure written to {plot}")
 
 
 def _score_run(
@@ -135,7 +128,9 @@ def _score_run(
     if how.align == "se3":
         write_metrics(folder, metrics)
     if plot is not None:
-        _draw(plot, matched, truth, "z")
+        from segslam.output.report.comparison import draw_scored
+
+        draw_scored(plot, matched, truth)
     more = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance)
     return more | metrics if how.align == "se3" else metrics | more
 
@@ -161,17 +156,10 @@ def _score_folders(estimates: Path, references: Path, how: Scoring) -> dict[str,
     return rows | ({"mean": mean} if len(rows) > 1 else {})
 
 
-def _draw(file: Path, estimate: "Poses", reference: "Poses", up: "Up") -> None:
-    from segslam.output.report.comparison import check_picture, draw_scored
-
-    check_picture(file)
-    draw_scored(file, estimate, reference, up=up)
-
-
 def _score_files(
     estimate_file: Path, reference_file: Path, how: Scoring, plot: Path | None, terminal: Terminal
 ) -> dict[str, Any]:
-    from segslam.core.evaluation import UP
+    from segslam.core.evaluation import UP, upward_axis
     from segslam.core.trajectory import read_poses
     from segslam.output.accuracy import scores
     from segslam.run.evaluate import matching_rows
@@ -188,27 +176,25 @@ def _score_files(
         )
     rows = matching_rows(estimate, reference, max_difference_ns=round(how.max_difference * 1e9))
     matched, truth = estimate.T_a_b[rows[:, 0]], reference.T_a_b[rows[:, 1]]
-    direction, why = (how.up, "") if how.up or not len(rows) else _up(truth, camera=estimate.stamp_ns is None)
-    figures = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance, up=UP[direction or "z"])
+    up, why = how.up, ""
+    if up is None and len(rows):
+        up, why = upward_axis(truth), "the path is flattest along it"
+        if up is None and estimate.stamp_ns is None:
+            up, why = "-y", "as in KITTI's files; the path does not show it"
+        elif up is None:
+            up, why = "z", "the path does not show it"
+    figures = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance, up=UP[up or "z"])
     if not figures:
         raise SegslamError(
             f"{estimate_file}: only {len(rows)} of its {len(estimate)} poses match one of the {len(reference)} "
             f"poses of {reference_file}; at least three are needed. Check the files, or raise --max-difference"
         )
     if why:
-        terminal.say(f"{reference_file}: upward axis {direction} ({why}); for another: --up")
+        terminal.say(f"{reference_file}: upward axis {up} ({why}); for another: --up")
     if plot is not None:
-        _draw(plot, matched, truth, direction or "z")
+        from segslam.output.report.comparison import draw_scored
+
+        draw_scored(plot, matched, truth, up=up or "z")
     if not len(rows) == len(estimate) == len(reference):
         terminal.say(f"scored {len(rows)} poses; estimate {len(estimate)}, reference {len(reference)}")
-    return figures | {"num_poses": len(rows), "up": direction}
-
-
-def _up(reference: "Poses", *, camera: bool) -> tuple["Up", str]:
-    """The upward axis of the files, and how it is known."""
-    from segslam.core.evaluation import upward_axis
-
-    found = upward_axis(reference)
-    if found is not None:
-        return found, "the path is flattest along it"
-    return ("-y", "as in KITTI's files; the path does not show it") if camera else ("z", "the path does not show it")
+    return figures | {"num_poses": len(rows), "up": up}

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from segslam.cli.checks import check_exists, check_free
-from segslam.cli.console import Terminal, print_out
+from segslam.cli.console import Terminal
 from segslam.cli.ending import map_summary
 from segslam.cli.options import GnssOptions, OverwriteOption, Settings
 from segslam.core.errors import SegslamError
@@ -113,6 +113,6 @@ def georeference(
     placed = place(folder)
     write_report(folder)
     if terminal.json:
-        print_out((folder / FILE).read_text(encoding="utf-8").rstrip())
+        print((folder / FILE).read_text(encoding="utf-8").rstrip(), flush=True)
     else:
         terminal.say(f"{placed}\nresults in {folder}: georeference.json, gnss.csv, poses_geodetic.csv")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.checks import check_exists, check_free, live_configs, make_room, show_preset
+from segslam.cli.checks import check_exists, check_free, live_configs, make_folder, show_preset
 from segslam.cli.console import Terminal, how_to_go_on
 from segslam.cli.ending import counted, finish
 from segslam.cli.options import GnssOptions, PresetOption, RunOutput
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from segslam.output.foxglove_server import FoxgloveServer
     from segslam.output.viewer import Scene
     from segslam.run.live.front import Front
-    from segslam.run.live.live_map import LiveMap, Show
+    from segslam.run.live.live_map import Show
     from segslam.run.live.ros import MappingPublisher
     from segslam.run.live.serve import Placed
     from segslam.run.live.waiting import Source
@@ -57,7 +57,7 @@ def live(
     idle: Annotated[
         float | None, typer.Option(min=0.1, metavar="SECONDS", help="End after this time without a new scan.")
     ] = None,
-    labels: Annotated[str, typer.Option("--labels", help="Labels: geometric (auto is the same) or none.")] = "auto",
+    labels: Annotated[str, typer.Option(help="Labels: geometric (auto is the same) or none.")] = "auto",
     preset: PresetOption = "auto",
     output: RunOutput,
     gnss: GnssOptions,
@@ -69,18 +69,14 @@ def live(
     """
     if output.view:
         check_display()
-    _check_source(folder, topic, out)
-    if gnss.gnss is not None:
-        _check_ros("--gnss")
+    _check_source(folder, topic, gnss.gnss, out)
     output.load()  # reports a wrong setting before large libraries are loaded
     if labels not in ("auto", "geometric", "none"):
         raise SegslamError(f"--labels {labels}: live scans get geometric labels; give geometric or none")
     terminal.announce("live: starting")
     configs = live_configs(preset, output)
     from segslam.labels.label_files import unlabelled
-    from segslam.output.folder import new_folder
     from segslam.run.live.front import Front
-    from segslam.run.live.live_map import LiveMap
     from segslam.run.run import Run
     from segslam.slam.slam import Slam
 
@@ -93,8 +89,7 @@ def live(
     with ExitStack() as stack:
         scene = stack.enter_context(scene_in(None)) if output.view else None
         server = serve_foxglove(output.foxglove, stack, terminal)
-        make_room(out, overwrite=output.overwrite, inputs=[folder])
-        out = new_folder(out)
+        make_folder(out, overwrite=output.overwrite, inputs=[folder])
         stack.callback(_remove_if_empty, out)
         terminal.compile_kernels()
         go_on = f"make the results from the log: segslam replay {shlex.quote(str(out))} --out NEW"
@@ -114,9 +109,8 @@ def live(
         slam = Slam(settings, labeller=(lambda points: unlabelled(len(points))) if labels == "none" else None)
         mirror = server.send if server else None
         run = stack.enter_context(Run(out, slam, dataset=source.name, options=recorded, mirror=mirror))
-        publisher = _publisher(source, run, stack)
-        with LiveMap(_shows(server, publisher)) as live_map:
-            figures = _follow(front, run, terminal, scene=scene, live_map=live_map, publisher=publisher)
+        publisher = _publisher(run, stack) if folder is None else None
+        figures = _follow(front, run, terminal, scene=scene, server=server, publisher=publisher)
         ended = front.ended
         if run.num_steps == 0:
             raise SegslamError(f"{source.name}: no scan was mapped{f' ({ended.why})' if ended.why else ''}")
@@ -152,15 +146,21 @@ def _follow(
     terminal: Terminal,
     *,
     scene: "Scene | None",
-    live_map: "LiveMap",
+    server: "FoxgloveServer | None",
     publisher: "MappingPublisher | None",
 ) -> "LiveFigures":
     """Close the loops of each scan with a pose, log it and pass it to all displays."""
     from segslam.core.types import Step
+    from segslam.run.live.live_map import LiveMap
 
     figures = LiveFigures(front)
     shown = monotonic()
-    with _status(terminal) as (show, every_s):
+    shows: list[Show] = []
+    if server:
+        shows.append(lambda drawn: server.send_map(drawn.points, drawn.labels, drawn.stamp_ns))
+    if publisher:
+        shows.append(publisher.show_map)
+    with LiveMap(shows) as live_map, _status(terminal) as (show, every_s):
         for placed in front:
             tries_loops = front.num_keyframes_waiting < MOST_BEHIND
             step = run.follow(placed.tracked, tries_loops=tries_loops)
@@ -180,18 +180,8 @@ def _follow(
     return figures
 
 
-def _shows(server: "FoxgloveServer | None", publisher: "MappingPublisher | None") -> "list[Show]":
-    """Functions that display an updated map."""
-    shows: list[Show] = []
-    if server:
-        shows.append(lambda drawn: server.send_map(drawn.points, drawn.labels, drawn.stamp_ns))
-    if publisher:
-        shows.append(publisher.show_map)
-    return shows
-
-
-def _check_source(folder: Path | None, topic: str | None, out: Path) -> None:
-    """Raises SegslamError unless exactly one source is given; called before large libraries are imported."""
+def _check_source(folder: Path | None, topic: str | None, fixes: str | None, out: Path) -> None:
+    """Raises SegslamError unless there is one source, and ROS 2 for topics; before large libraries are imported."""
     if (folder is None) == (topic is None):
         raise SegslamError(
             "give one source: a folder into which scans are written, as in segslam live /data/scans --out runs/now, "
@@ -201,15 +191,11 @@ def _check_source(folder: Path | None, topic: str | None, out: Path) -> None:
         check_exists(folder, "give the folder into which scans are written")
         if not folder.is_dir():
             raise SegslamError(f"{folder}: not a folder; for a recording: segslam map {folder} --out {out}")
-    else:
-        _check_ros("--topic")
-
-
-def _check_ros(option: str) -> None:
-    if find_spec("rclpy") is None:
-        raise SegslamError(
-            f"{option} needs ROS 2: source its setup script (Jazzy, Kilted), or: {how_to_install('ros')}"
-        )
+    for option, value in (("--topic", topic), ("--gnss", fixes)):
+        if value is not None and find_spec("rclpy") is None:
+            raise SegslamError(
+                f"{option} needs ROS 2: source its setup script (Jazzy, Kilted), or: {how_to_install('ros')}"
+            )
 
 
 def _source(folder: Path | None, topic: str | None, *, intensities: bool, vertical_angle_deg: float) -> "Source":
@@ -226,13 +212,9 @@ def _source(folder: Path | None, topic: str | None, *, intensities: bool, vertic
     return TopicSource(topic or "", intensities=intensities, vertical_angle_deg=vertical_angle_deg)
 
 
-def _publisher(source: "Source", run: "Run", stack: ExitStack) -> "MappingPublisher | None":
-    """The publisher of path and map if the source is a topic; it also saves the map on request."""
-    from segslam.run.live.folder import FolderSource
+def _publisher(run: "Run", stack: ExitStack) -> "MappingPublisher":
+    """The publisher of path and map, for a topic; it also saves the map on request."""
     from segslam.run.live.live_map import save_map
-
-    if isinstance(source, FolderSource):
-        return None
     from segslam.run.live.ros import MappingPublisher
 
     def save() -> str:

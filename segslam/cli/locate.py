@@ -1,7 +1,7 @@
 """`segslam locate` and `register`: poses of single scans, in a map or in another scan."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from json import dumps
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,8 +11,8 @@ from typer.core import TyperCommand
 
 from segslam.bench.experiments.method_settings import METHOD_NAMES, check_method
 from segslam.cli.checks import check_exists
-from segslam.cli.completion import labels_or_files, one_of
-from segslam.cli.console import Terminal, print_json, print_out, say
+from segslam.cli.completion import labels_or_files
+from segslam.cli.console import Terminal, print_json, say
 from segslam.cli.options import EncodingOption, Settings
 from segslam.core.errors import SegslamError
 
@@ -20,8 +20,11 @@ if TYPE_CHECKING:
     from segslam.bench.experiments.baselines import Estimate
     from segslam.core.config import Config
     from segslam.core.threads import Stopwatch
-    from segslam.core.types import Labels, Points, Rejected, Scan, ScanLabels
-    from segslam.run.locator import Located, Locator
+    from segslam.core.types import Labels, Points, Rejected, Scan, ScanLabels, Vector
+    from segslam.run.locator import Located
+
+    LabelsOf = Callable[[str, Points, Vector | None], ScanLabels]
+    """Labels of a scan, given its name, points and intensities."""
 
 LABEL_WORDS = ("geometric", "none")
 NOT_FOUND: dict[str, Any] = {"found": False} | dict.fromkeys(
@@ -30,22 +33,12 @@ NOT_FOUND: dict[str, Any] = {"found": False} | dict.fromkeys(
 
 
 @dataclass(frozen=True)
-class _ListTerminal(Terminal):
-    """As `Terminal`; the figures are those of several scans."""
-
-    json: Annotated[
-        bool,
-        typer.Option("--json", help="Print a JSON list with one object per scan on standard output, and nothing else."),
-    ] = False
-
-
-@dataclass(frozen=True)
 class ScanFileOptions:
     """What the scans of both commands have in common."""
 
     dataset: Annotated[
         str | None,
-        typer.Option(autocompletion=one_of("kitti"), help="kitti: apply KITTI's correction of the vertical angles."),
+        typer.Option(autocompletion=lambda: ["kitti"], help="kitti: apply KITTI's correction of the vertical angles."),
     ] = None
     encoding: EncodingOption = None
 
@@ -56,15 +49,18 @@ class ScanFileOptions:
                 f"--dataset {self.dataset}: only kitti needs a correction; omit the option for other data"
             )
 
-    def ready(self, file: Path, points: "Points", labels: "ScanLabels", config: "Config") -> "Scan":
-        """The usable points of a file, corrected, and their labels."""
+    def read(self, file: Path, labels_of: "LabelsOf", config: "Config") -> "Scan":
+        """The usable points of a file, corrected, and their labels. Raises SegslamError, naming the file, if bad."""
+        from segslam.scans.clouds import read_file
         from segslam.scans.dataset import make_scan
         from segslam.scans.kitti import VERTICAL_ANGLE_DEG
 
+        cloud = read_file(file)
+        labels = labels_of(file.stem, cloud.points, cloud.intensities)
         angle_deg = config.sensor.vertical_angle_deg
         if angle_deg is None:
             angle_deg = VERTICAL_ANGLE_DEG if self.dataset == "kitti" else 0.0
-        return make_scan(file, 0, 0, points, labels, vertical_angle_deg=angle_deg)
+        return make_scan(file, 0, 0, cloud.points, labels, vertical_angle_deg=angle_deg)
 
 
 class LabelsCommand(TyperCommand):
@@ -92,9 +88,11 @@ def locate(
         str, typer.Option(help="Labels: geometric, none, or a folder of .label files named like the scans.")
     ] = "geometric",
     files: ScanFileOptions,
-    terminal: _ListTerminal,
+    terminal: Terminal,
 ) -> None:
     """Find the poses of single scans in a finished run, without an initial guess. Exit status 1 if none is found.
+
+    `--json` prints a list with one object per scan.
 
     Example: segslam locate runs/00 004413.bin 000020.bin --dataset kitti
     """
@@ -104,9 +102,13 @@ def locate(
     for file in label_files:
         check_exists(file, "--labels: give geometric, none, or a folder with a .label file for each scan")
     terminal.announce(f"locate: reading {run}")
+    from segslam.labels.label_files import LabelSource, computed, encoding_of
     from segslam.run.locator import Locator
 
     files.check()
+    source = LabelSource(labels == "geometric")
+    if label_files:
+        source = LabelSource(False, Path(labels), files.encoding or encoding_of(label_files))
     locator = Locator.from_run(run)
     terminal.compile_kernels()
     num_bad = 0
@@ -114,16 +116,17 @@ def locate(
     for scan in terminal.progress(scans, len(scans), "locate"):
         started = perf_counter()
         try:
-            points, classes = _read_one(scan, label_files, labels, files, locator)
+            ready = files.read(scan, source.read, locator.config)
+            classes = None if labels == "geometric" else computed(ready.labels)
         except SegslamError as error:
             num_bad += 1
             one = NOT_FOUND | {"reason": "unreadable", "detail": str(error).partition("; ")[0]}
         else:
             started = perf_counter()
-            one = _place(locator.locate(points, classes))
+            one = _place(locator.locate(ready.points, classes))
         found.append(one | {"seconds": perf_counter() - started})
     if terminal.json:
-        print_out(dumps(found, allow_nan=False))
+        print_json(found)
     else:
         _show_places(scans, found, terminal)
     if num_bad:
@@ -145,7 +148,7 @@ def register(
     ] = None,
     files: ScanFileOptions,
     method: Annotated[
-        str, typer.Option(autocompletion=one_of(*METHOD_NAMES), help=f"Method: {', '.join(METHOD_NAMES)}.")
+        str, typer.Option(autocompletion=lambda: METHOD_NAMES, help=f"Method: {', '.join(METHOD_NAMES)}.")
     ] = "segregator-c2f",
     refine: Annotated[
         bool, typer.Option("--refine/--no-refine", help="Refine the coarse pose with GICP (method segregator-c2f).")
@@ -170,69 +173,47 @@ def register(
     chosen = find_method(method)
     terminal.compile_kernels()
     watch = Stopwatch()
-    clouds = _read_two(source, target, labels, files, settings, watch)
+    clouds = _read_two(source, target, labels or ["geometric"], files, settings, watch)
     scans: list[dict[str, Any]] = []
     for name, (points, classes) in zip(("source", "target"), clouds, strict=True):
         with watch(f"describe_{name}"):
             scans.append(prepare_parts(points, classes, methods=[method], config=settings)[0])
     found = chosen.align(scans[0], scans[1], settings, watch)
     figures = _pose(found, watch)
-    _show_pose(figures, terminal)
+    if terminal.json:
+        print_json(figures)
+    elif figures["accepted"]:
+        _show_pose(figures, terminal)
     if not figures["accepted"]:
         say(f"rejected: {figures['reason']} ({figures['detail']})")
         raise typer.Exit(1)
 
 
-def _read_one(
-    scan: Path, label_files: list[Path], labels: str, files: ScanFileOptions, locator: "Locator"
-) -> tuple["Points", "Labels | None"]:
-    """Points of a scan and their labels; None for labels if they are to be computed from geometry."""
-    import numpy as np
-
-    from segslam.labels.label_files import computed, encoding_of, read_labels
-    from segslam.scans.clouds import read_file
-
-    points = read_file(scan).points
-    ids = np.zeros(len(points), np.uint8)
-    if label_files:
-        numbering = files.encoding or encoding_of(label_files)
-        ids = read_labels(Path(labels) / f"{scan.stem}.label", len(points), numbering)
-    ready = files.ready(scan, points, ids, locator.config)
-    return ready.points, None if labels == "geometric" else computed(ready.labels)
-
-
 def _read_two(
-    source: Path,
-    target: Path,
-    labels: list[str] | None,
-    files: ScanFileOptions,
-    config: "Config",
-    watch: "Stopwatch",
+    source: Path, target: Path, words: list[str], files: ScanFileOptions, config: "Config", watch: "Stopwatch"
 ) -> list[tuple["Points", "Labels"]]:
     """Points and labels of the two scans."""
     from segslam.labels import geometric_labels
     from segslam.labels.label_files import computed, encoding_of, open_labels, read_labels
-    from segslam.scans.clouds import read_file
 
     files.check()
     both = (source, target)
-    stored = [read_file(file) for file in both]
-    words = labels or ["geometric"]
-    classes: list[ScanLabels]
     if len(words) == 2:
-        named = [Path(word) for word in words]
-        numbering = files.encoding or encoding_of(named)
-        classes = [read_labels(file, len(cloud.points), numbering) for file, cloud in zip(named, stored, strict=True)]
+        label_files = [Path(word) for word in words]
+        numbering = files.encoding or encoding_of(label_files)
+
+        def of_file(file: Path) -> "LabelsOf":
+            return lambda _, points, __: read_labels(file, len(points), numbering)
+
+        sources = [of_file(file) for file in label_files]
     elif _is_word(words[0]):
-        labeller = open_labels(words[0], beside=source.parent, scan_names=(), encoding=None)
-        classes = [
-            labeller.read(file.stem, cloud.points, cloud.intensities) for file, cloud in zip(both, stored, strict=True)
-        ]
+        of_both: LabelsOf = open_labels(words[0], beside=source.parent, scan_names=(), encoding=None).read
+        sources = [of_both, of_both]
     else:
         raise SegslamError(
             f"--labels {words[0]}: give two .label files, source and target, or geometric, or network:MODEL"
         )
-    scans = [files.ready(file, one.points, ids, config) for file, one, ids in zip(both, stored, classes, strict=True)]
+    scans = [files.read(file, labels_of, config) for file, labels_of in zip(both, sources, strict=True)]
     with watch("label"):
         return [
             (scan.points, geometric_labels(scan.points) if words[0] == "geometric" else computed(scan.labels))
@@ -261,7 +242,7 @@ def _show_places(scans: list[Path], found: list[dict[str, Any]], terminal: Termi
     """Print file and pose of each scan on standard output, and details on standard error."""
     for scan, one in zip(scans, found, strict=True):
         if one["found"]:
-            print_out(f"{scan} " + " ".join(f"{value:.6f}" for value in one["T_world_lidar"]))
+            print(f"{scan} " + " ".join(f"{value:.6f}" for value in one["T_world_lidar"]), flush=True)
             terminal.say(
                 f"{scan}: at keyframe {one['keyframe']}, {one['inliers']} inliers, overlap {one['overlap']:.2f}, "
                 f"probability {one['probability']:.4f}, {1000 * one['seconds']:.0f} ms"
@@ -289,13 +270,8 @@ def _show_pose(figures: dict[str, Any], terminal: Terminal) -> None:
 
     from segslam.core.types import probability_text
 
-    if terminal.json:
-        print_json(figures)
-        return
-    if not figures["accepted"]:
-        return
     rows = np.array(figures["T_target_source"]).reshape(4, 4)
-    print_out("\n".join(" ".join(f"{value:12.6f}" for value in row) for row in rows))
+    print("\n".join(" ".join(f"{value:12.6f}" for value in row) for row in rows), flush=True)
     overlap = "" if figures["overlap"] is None else f", overlap {figures['overlap']:.2f}"
     times = ", ".join(f"{stage} {1000 * seconds:.0f} ms" for stage, seconds in figures["seconds"].items())
     if figures["probability"] is not None:

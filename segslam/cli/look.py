@@ -10,7 +10,7 @@ import typer
 from segslam.cli.checks import check_free, check_links, check_run
 from segslam.cli.console import Terminal
 from segslam.cli.options import LogArgument, OverwriteOption
-from segslam.cli.tables import figure, with_meaning
+from segslam.cli.tables import with_meanings
 from segslam.cli.viewers import check_display, scene_in
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def _lines(found: dict[str, Any]) -> str:
 
     then = f"; continue with: segslam resume {shlex.quote(found['run'])}" if found["state"] == "interrupted" else ""
     text = [f"{found['run']}: {found['data']}, {found['state']}, {found['num_steps']} scans in the log{then}"]
-    text += [with_meaning(f"{figure(value):>10}", FIGURES[key]) for key, value in found["figures"].items()]
+    text += with_meanings([found["figures"]], {key: FIGURES[key] for key in found["figures"]}).splitlines()
     for title, values in (("options", found["options"]), ("settings changed", found["changed_settings"])):
         text += [f"{title}: {'none' if not values else ''}".rstrip()]
         text += [f"  {key}={value}" for key, value in values.items()]

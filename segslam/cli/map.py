@@ -2,10 +2,9 @@
 
 import json as json_text
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -18,7 +17,7 @@ from segslam.cli.checks import (
     check_same,
     is_finished,
     log_to_resume,
-    make_room,
+    make_folder,
     preset_config,
 )
 from segslam.cli.console import Terminal, how_to_go_on, print_json, say
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
     from segslam.core.config import Config, MapConfig
     from segslam.core.types import BadScan, Step
     from segslam.odometry.sweep import Odometry
-    from segslam.output.log import Mirror, RunLog
+    from segslam.output.log import RunLog
     from segslam.run.map_folder import SlamOf
     from segslam.scans import Dataset
 
@@ -50,8 +49,7 @@ def map_command(
     output: RunOutput,
     gnss: GnssOptions,
     dry_run: Annotated[
-        bool,
-        typer.Option("--dry-run", help="Show the content of DATA and the settings; write nothing. Needs no --out."),
+        bool, typer.Option(help="Show the content of DATA and the settings; write nothing. Needs no --out.")
     ] = False,
     terminal: Terminal,
 ) -> None:
@@ -154,8 +152,12 @@ def map_data(
     *,
     dry_run: bool = False,
     in_map: Path | None = None,
+    go_on: str | None = None,
 ) -> None:
-    """Map scans into a folder, or localise them in the map of the run `in_map`; `dry_run` prints what would be done."""
+    """Map scans into a folder, or localise them in the map of the run `in_map`; `dry_run` prints what would be done.
+
+    `go_on`: how to continue a run that was stopped, by default with the command `resume`.
+    """
     if output.view:
         check_display()
     if options.resume and output.overwrite:
@@ -166,7 +168,7 @@ def map_data(
     settings = output.load(base=recorded.config if recorded else None)
     terminal.announce(f"map: opening {data}" if in_map is None else f"localise: reading the map of {in_map}")
     slam_of, place = _in_map(in_map)
-    from segslam.run.map_folder import given_odometry, open_scans, resume_options
+    from segslam.run.map_folder import given_odometry, in_effect, open_scans, resume_options
 
     map_names, map_files = output.maps(folder)
     check_free([file for file in map_files if folder not in file.parents], overwrite=output.overwrite or options.resume)
@@ -174,9 +176,8 @@ def map_data(
     scans = open_scans(source, settings)
     if settings.map.color == "intensity":
         check_intensities(scans)
-    choices = resume_options(source, odometry=options.odometry, map_files=map_names)
+    choices = resume_options(source, odometry=options.odometry, map_files=map_names) | gnss.recorded()
     place = gnss.placing(data) or place
-    choices |= gnss.recorded()
     choices |= {"in_map": str(in_map.expanduser().resolve())} if in_map else {}
     if recorded is None:
         settings = output.load(base=preset_config(options.preset, scans, terminal))
@@ -192,27 +193,22 @@ def map_data(
         check_same(recorded, settings, dataset=scans.name, options=repeated)
         if is_finished(recorded, scans):
             _show_complete(recorded, map_files, terminal, config=settings.map, place=place)
-            raise typer.Exit(0)
-    else:
-        make_room(folder, overwrite=output.overwrite, inputs=(data, in_map, options.odometry))
-    with ExitStack() as stack:
-        scene = stack.enter_context(scene_in(None)) if output.view else None
-        server = serve_foxglove(output.foxglove, stack, terminal)
-        map_scans(
-            scans,
-            folder,
-            terminal,
-            settings=settings,
-            odometry=given,
-            options=choices,
-            recorded=recorded,
-            map_files=map_files,
-            watch=scene.add if scene else None,
-            go_on=f"continue with: segslam resume {shlex.quote(str(folder))}",
-            slam_of=slam_of,
-            place=place,
-            mirror=server.send if server else None,
-        )
+            return
+    _map_scans(
+        scans,
+        folder,
+        output,
+        terminal,
+        inputs=(data, in_map, options.odometry),
+        settings=in_effect(settings, scans),
+        odometry=given,
+        options=choices,
+        recorded=recorded,
+        map_files=map_files,
+        slam_of=slam_of,
+        place=place,
+        go_on=go_on or f"continue with: segslam resume {shlex.quote(str(folder))}",
+    )
 
 
 def _in_map(in_map: Path | None) -> "tuple[SlamOf | None, Callable[[Path], str] | None]":
@@ -254,62 +250,61 @@ def _show_complete(
         print_json(read_metrics(folder))
 
 
-def map_scans(
+def _map_scans(
     scans: "Dataset",
-    out: Path,
+    folder: Path,
+    output: RunOutput,
     terminal: Terminal,
     *,
+    inputs: Iterable[Path | None],
     settings: "Config",
-    odometry: "Odometry | None" = None,
-    options: Mapping[str, str] = MappingProxyType({}),
-    recorded: "RunLog | None" = None,
-    map_files: Sequence[Path] = (),
-    watch: "Callable[[Step | BadScan], None] | None" = None,
-    mirror: "Mirror | None" = None,
-    slam_of: "SlamOf | None" = None,
-    place: Callable[[Path], str] | None = None,
+    odometry: "Odometry | None",
+    options: Mapping[str, str],
+    recorded: "RunLog | None",
+    map_files: Sequence[Path],
+    slam_of: "SlamOf | None",
+    place: Callable[[Path], str] | None,
     go_on: str,
 ) -> None:
     """Map a data set into a new folder, or resume the run `recorded`, and show the figures.
 
-    The run keeps the vertical angle with which the data set was opened. `watch` is called with each step, `mirror` with
-    each message of the log; `slam_of` creates the pipeline, `place` georeferences the run. Raises typer.Exit(130) if
-    Ctrl-C ended the run early; `go_on`, the command that continues it, is then printed.
+    `inputs`: what must not be in a folder that is replaced. `slam_of` creates the pipeline, `place` georeferences the
+    run. Raises typer.Exit(130) if Ctrl-C ended the run early; `go_on` is then printed.
     """
     from segslam.odometry.apart import OdometryApart
-    from segslam.output.folder import new_folder
-    from segslam.run.map_folder import begun, in_effect
+    from segslam.run.map_folder import begun
     from segslam.slam.slam import Slam
 
-    settings = in_effect(settings, scans)
-    folder = out if recorded else new_folder(out)
-    terminal.compile_kernels()
-    for file in map_files:
-        file.parent.mkdir(parents=True, exist_ok=True)
-    when_stopped(f"the log in {folder} is kept; {go_on}")
-
-    def watched(steps: "Iterator[Step | BadScan]", total: int, title: str) -> bool:
-        """Shows each step and progress; True if Ctrl-C ended it early."""
-        shown = terminal.progress(steps, total, title)
-        return is_interrupted(shown if watch is None else map(watch, shown))
-
-    apart = OdometryApart(settings.odometry, keeps_alone=True) if odometry is None else nullcontext(odometry)
     with ExitStack() as stack:
+        scene = stack.enter_context(scene_in(None)) if output.view else None
+        server = serve_foxglove(output.foxglove, stack, terminal)
+        if recorded is None:
+            make_folder(folder, overwrite=output.overwrite, inputs=inputs)
+        terminal.compile_kernels()
+        for file in map_files:
+            file.parent.mkdir(parents=True, exist_ok=True)
+        when_stopped(f"the log in {folder} is kept; {go_on}")
         stack.enter_context(how_to_go_on(f"{go_on} when there is space"))
-        used = stack.enter_context(apart)
-        run = stack.enter_context(
-            begun(
-                scans,
-                folder,
-                settings,
-                odometry=used,
-                slam_of=slam_of or Slam,
-                options=options,
-                resumes=recorded is not None,
-                mirror=mirror,
+
+        def watched(steps: "Iterator[Step | BadScan]", total: int, title: str) -> bool:
+            """Shows each step and progress; True if Ctrl-C ended it early."""
+            shown = terminal.progress(steps, total, title)
+            return is_interrupted(map(scene.add, shown) if scene else shown)
+
+        apart = OdometryApart(settings.odometry, keeps_alone=True) if odometry is None else nullcontext(odometry)
+        with apart as used:
+            run = stack.enter_context(
+                begun(
+                    scans,
+                    folder,
+                    settings,
+                    odometry=used,
+                    slam_of=slam_of or Slam,
+                    options=options,
+                    resumes=recorded is not None,
+                    mirror=server.send if server else None,
+                )
             )
-        )
-        with apart:
             if recorded is not None and watched(run.resume(recorded, scans), recorded.num_steps(), "resume"):
                 raise typer.Exit(EXIT_STATUS)  # the log is as before
             left = len(scans) - run.num_scans_resumed - run.num_scans_skipped

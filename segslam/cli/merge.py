@@ -5,10 +5,10 @@ from typing import Annotated
 
 import typer
 
-from segslam.cli.checks import check_exists, check_own, make_room
-from segslam.cli.console import Terminal, print_out
+from segslam.cli.checks import check_exists, check_own, make_folder
+from segslam.cli.console import Terminal
 from segslam.cli.ending import finish, is_interrupted
-from segslam.cli.options import WITH_MAP, OverwriteOption, RunSettings, Settings, WithMapOption
+from segslam.cli.options import WITH_MAP, RunSettings, Settings, WithMapOption
 from segslam.core.errors import SegslamError
 from segslam.core.interrupts import EXIT_STATUS, when_stopped
 
@@ -18,14 +18,10 @@ def merge(
     *,
     out: Annotated[Path, typer.Option(help="New folder for the merged run.")],
     same_reference: Annotated[
-        bool,
-        typer.Option(
-            "--same-reference", help="The true poses of all runs are in one frame: score the merged trajectory."
-        ),
+        bool, typer.Option(help="The true poses of all runs are in one frame: score the merged trajectory.")
     ] = False,
     with_map: WithMapOption = False,
     changes: RunSettings,
-    overwrite: OverwriteOption = False,
     terminal: Terminal,
 ) -> None:
     """Merge runs that share places into one run: one frame, one map, one log.
@@ -38,9 +34,9 @@ def merge(
     """
     for folder in runs:
         check_exists(folder, "give the folders of finished runs")
-    from segslam.output.folder import check_new, new_folder
+    from segslam.output.folder import check_new
 
-    if not overwrite:
+    if not changes.overwrite:
         check_new(out)
     changes.load()  # reports a wrong setting before the logs are read
     terminal.announce(f"merge: reading {len(runs)} runs")
@@ -52,8 +48,7 @@ def merge(
     settings = changes.load(base=sessions[0].run.config)
     merged = plan(sessions, config=settings, same_reference=same_reference, progress=terminal.progress)
     terminal.say(merged.summary())
-    make_room(out, overwrite=overwrite, inputs=runs)
-    folder = new_folder(out)
+    folder = make_folder(out, overwrite=changes.overwrite, inputs=runs)
     when_stopped(f"the log in {folder} is kept, without results")
     with merged.begun(folder, settings) as run:
         if is_interrupted(terminal.progress(run.take(merged.steps()), merged.num_steps, "merge")):
@@ -78,8 +73,7 @@ def fleet(
         typer.Option(help="Number of processes on this machine, by default one for two cores.", min=1),
     ] = None,
     same_reference: Annotated[
-        bool,
-        typer.Option("--same-reference", help="The true poses of all drives are in one frame: score each component."),
+        bool, typer.Option(help="The true poses of all drives are in one frame: score each component.")
     ] = False,
     changes: Settings,
     terminal: Terminal,
@@ -119,7 +113,7 @@ def fleet(
         say=terminal.say,
     )
     if terminal.json:
-        print_out((result.folder / FILE).read_text(encoding="utf-8").rstrip())
+        print((result.folder / FILE).read_text(encoding="utf-8").rstrip(), flush=True)
         return
     for number, component in enumerate(result.components):
         error = f", error {component['ate_m']:.3f} m" if "ate_m" in component else ""

@@ -10,7 +10,7 @@ from segslam.cli.checks import check_free
 from segslam.cli.console import Terminal
 from segslam.cli.options import OverwriteOption
 from segslam.core.errors import SegslamError
-from segslam.core.whole_files import check_target, whole_file
+from segslam.core.whole_files import whole_file
 
 if TYPE_CHECKING:
     from segslam.graph.batch import Optimized
@@ -29,7 +29,7 @@ def optimize(
         ),
     ] = "consistent",
     overwrite: OverwriteOption = False,
-    force: Annotated[bool, typer.Option("--force", hidden=True, help="The same as --overwrite.")] = False,
+    force: Annotated[bool, typer.Option(hidden=True, help="The same as --overwrite.")] = False,
     terminal: Terminal,
 ) -> None:
     """Optimise a pose graph. Errors are half the chi-square, as in GTSAM, of the edges that were not rejected.
@@ -38,7 +38,6 @@ def optimize(
 
     Example: segslam optimize parking-garage.g2o --out optimum.g2o
     """
-    check_target(out)
     check_free([out], overwrite=overwrite or force)
     terminal.announce(f"optimize: reading {graph}")
     from segslam.graph.batch import optimize_graph

@@ -6,13 +6,13 @@ from contextlib import ExitStack
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import typer
+from typer.models import OptionInfo
 
 from segslam.cli import completion
 from segslam.core.errors import SegslamError
-from segslam.core.whole_files import check_target
 
 if TYPE_CHECKING:
     from segslam.core.config import Config
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 WITH_MAP = ("map.ply", "map.png")
 """Files that `--map` writes into the run folder."""
 
+VALUE_NAMES: dict[Any, str] = {Path: "PATH", str: "TEXT", int: "N", float: "NUMBER"}
 GNSS_USES = ("fuse", "align")
 MOST_OFFSET_S = 4e9
 """As far as the clock of a computer that begins in 1970 can be off."""
@@ -30,23 +31,19 @@ LogArgument = Annotated[Path, typer.Argument(help="Run folder, or its log.mcap, 
 DatasetOption = Annotated[
     str | None,
     typer.Option(
-        "--dataset",
-        autocompletion=completion.datasets,
-        help="Kind of data: kitti, or a reader of kiss-icp; detected by default.",
+        autocompletion=completion.datasets, help="Kind of data: kitti, or a reader of kiss-icp; detected by default."
     ),
 ]
 Numbering = Literal["raw", "learning", "learning-0"]
 EncodingOption = Annotated[
     Numbering | None,
     typer.Option(
-        "--encoding",
-        help="Numbering of the label files, if it cannot be detected: raw, learning (0-19), learning-0 (0-18).",
+        help="Numbering of the label files, if it cannot be detected: raw, learning (0-19), learning-0 (0-18)."
     ),
 ]
 FoxgloveOption = Annotated[
     str | None,
     typer.Option(
-        "--foxglove",
         metavar="PORT",
         help="Serve the run live to Foxglove on this port of 127.0.0.1; ADDRESS:PORT for another address.",
     ),
@@ -54,24 +51,20 @@ FoxgloveOption = Annotated[
 LabelsOption = Annotated[
     str,
     typer.Option(
-        "--labels",
         autocompletion=completion.labels_or_files,
         help="Labels: auto (labels/ if present, else geometric), none, geometric, network:MODEL.onnx, or a folder.",
     ),
 ]
-OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="Replace the run or the files that exist under this name.")
-]
+OverwriteOption = Annotated[bool, typer.Option(help="Replace the run or the files that exist under this name.")]
 PresetOption = Annotated[
     str,
     typer.Option(
-        "--preset",
         autocompletion=completion.presets,
         help="Settings for an environment: driving, campus or indoor; auto: by the scans.",
     ),
 ]
-SequenceOption = Annotated[str, typer.Option("--sequence", help="Sequence of the data set.")]
-ViewOption = Annotated[bool, typer.Option("--view", help="Show the run in the Rerun viewer while it is mapped.")]
+SequenceOption = Annotated[str, typer.Option(help="Sequence of the data set.")]
+ViewOption = Annotated[bool, typer.Option(help="Show the run in the Rerun viewer while it is mapped.")]
 WithMapOption = Annotated[
     bool, typer.Option("--map", help="Also write the map: map.ply (cloud) and map.png (top view).")
 ]
@@ -81,9 +74,9 @@ WithMapOption = Annotated[
 class Settings:
     """The settings of a command."""
 
-    config: Annotated[
-        Path | None, typer.Option("--config", help="YAML file with the settings that differ from the defaults.")
-    ] = None
+    config: Annotated[Path | None, typer.Option(help="YAML file with the settings that differ from the defaults.")] = (
+        None
+    )
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -112,11 +105,12 @@ class RunSettings(Settings):
     refine_minutes: Annotated[
         float | None,
         typer.Option(
-            "--refine-minutes",
             metavar="MINUTES",
             help="Time limit of the adjustment of the whole map after the loops; 60 by default, 0: no adjustment.",
         ),
     ] = None
+
+    overwrite: OverwriteOption = False
 
     def overrides(self) -> list[str]:
         """Those of `--set`, followed by that of `--refine-minutes`."""
@@ -137,10 +131,9 @@ class RunOutput(RunSettings):
     ] = None
     view: ViewOption = False
     foxglove: FoxgloveOption = None
-    overwrite: OverwriteOption = False
 
     def maps(self, folder: Path) -> tuple[list[Path], list[Path]]:
-        """Map files as given, and as paths in the run folder. Raises SegslamError if one cannot be written."""
+        """Map files as given, and as paths in the run folder. Raises SegslamError for an unknown kind of map."""
         names = [*map(Path, WITH_MAP if self.with_map else ()), *(self.map_file or ())]
         if not names:
             return [], []
@@ -148,9 +141,6 @@ class RunOutput(RunSettings):
 
         files = [folder / name for name in names]
         check_names(files)
-        for file in files:
-            if folder not in file.parents:
-                check_target(file)
         return names, files
 
 
@@ -161,29 +151,17 @@ class ScanOptions:
     dataset: DatasetOption = None
     sequence: SequenceOption = "00"
     frames: Annotated[
-        str | None,
-        typer.Option("--frames", metavar="A:B[:STEP]", help="Use scans A to B by number, B excluded; every STEP-th."),
+        str | None, typer.Option(metavar="A:B[:STEP]", help="Use scans A to B by number, B excluded; every STEP-th.")
     ] = None
     topic: Annotated[
-        str, typer.Option("--topic", help="Point cloud topic, if the recording (rosbag, mcap) has more than one.")
+        str, typer.Option(help="Point cloud topic, if the recording (rosbag, mcap) has more than one.")
     ] = ""
 
-    def source(
-        self, data: Path, labels: str = "none", encoding: Any = None, *, vertical_angle_deg: float | None = None
-    ) -> "DataSource":
+    def source(self, data: Path, labels: str = "none", encoding: Any = None) -> "DataSource":
         """What opens the scans."""
         from segslam.scans import DataSource
 
-        return DataSource(
-            data,
-            self.sequence,
-            self.dataset,
-            labels,
-            encoding,
-            self.frames,
-            self.topic,
-            vertical_angle_deg=vertical_angle_deg,
-        )
+        return DataSource(data, self.sequence, self.dataset, labels, encoding, self.frames, self.topic)
 
 
 @dataclass(frozen=True)
@@ -193,16 +171,15 @@ class RunOptions(ScanOptions):
     labels: LabelsOption = "auto"
     encoding: EncodingOption = None
     odometry: Annotated[
-        Path | None,
-        typer.Option("--odometry", help="Trajectory to use instead of KISS-ICP (KITTI or TUM format, LiDAR frame)."),
+        Path | None, typer.Option(help="Trajectory to use instead of KISS-ICP (KITTI or TUM format, LiDAR frame).")
     ] = None
     preset: PresetOption = "auto"
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the interrupted run in --out.")] = False
+    resume: Annotated[bool, typer.Option(help="Continue the interrupted run in --out.")] = False
 
 
 @dataclass(frozen=True)
 class GnssOptions:
-    """Position fixes and their use."""
+    """Position fixes and their use. Raises SegslamError for a wrong one."""
 
     gnss: Annotated[
         str | None,
@@ -216,14 +193,19 @@ class GnssOptions:
     ] = "fuse"
     gnss_offset: Annotated[float, typer.Option(help="Seconds to add to the times of the fixes.")] = 0.0
 
+    def __post_init__(self) -> None:
+        if self.gnss is not None and not abs(self.gnss_offset) < MOST_OFFSET_S:
+            raise SegslamError(f"--gnss-offset {self.gnss_offset}: not a difference of clocks in seconds")
+        if self.gnss is not None and self.gnss_use not in GNSS_USES:
+            raise SegslamError(f"--gnss-use {self.gnss_use}: unknown; known: {', '.join(GNSS_USES)}")
+
     def placing(self, recording: Path | None = None) -> Callable[[Path], str] | None:
         """Reads the fixes; returns what georeferences a run folder with them and tells the result. None without fixes.
 
-        `recording`: where a topic is read. Raises SegslamError for a wrong option, or fixes that cannot be read.
+        `recording`: where a topic is read. Raises SegslamError for fixes that cannot be read.
         """
         if self.gnss is None:
             return None
-        self._check()
         from segslam.gnss.reading import read_fixes
         from segslam.output.georeferenced import georeference, summary
 
@@ -233,11 +215,10 @@ class GnssOptions:
     def placing_live(self, stack: ExitStack) -> Callable[[Path], str] | None:
         """Listens to a ROS 2 topic until `stack` ends; returns what georeferences a run with the fixes that arrived.
 
-        None without a topic. Raises SegslamError for a wrong option.
+        None without a topic.
         """
         if self.gnss is None:
             return None
-        self._check()
         from segslam.output.georeferenced import georeference_if_possible
         from segslam.run.live.ros import FixTopic
 
@@ -245,12 +226,6 @@ class GnssOptions:
         return lambda folder: georeference_if_possible(
             folder, name, topic.rows.copy(), use=self.gnss_use, offset_s=self.gnss_offset
         )
-
-    def _check(self) -> None:
-        if not abs(self.gnss_offset) < MOST_OFFSET_S:
-            raise SegslamError(f"--gnss-offset {self.gnss_offset}: not a difference of clocks in seconds")
-        if self.gnss_use not in GNSS_USES:
-            raise SegslamError(f"--gnss-use {self.gnss_use}: unknown; known: {', '.join(GNSS_USES)}")
 
     def recorded(self) -> dict[str, str]:
         """The options as the log of a run keeps them, for `resume`."""
@@ -262,7 +237,7 @@ class GnssOptions:
 
     @classmethod
     def of(cls, recorded: Mapping[str, str]) -> "GnssOptions":
-        """The options from the log of a run. Raises SegslamError for a damaged offset."""
+        """The options from the log of a run. Raises SegslamError if they are damaged."""
         try:
             offset_s = float(recorded.get("gnss_offset") or 0.0)
         except ValueError as error:
@@ -271,7 +246,11 @@ class GnssOptions:
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The command with the fields of each parameter that is annotated with a dataclass in place of that parameter."""
+    """The command with the fields of each parameter that is annotated with a dataclass in place of that parameter.
+
+    An option without a name of its own is called like its parameter; a flag has no opposite `--no-...`. The help shows
+    PATH, TEXT, N or NUMBER for a value, also for lists and optional values.
+    """
     own = inspect.signature(command, eval_str=True)
     records: dict[str, type[Any]] = {
         name: one.annotation
@@ -290,6 +269,17 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
         for name, one in own.parameters.items()
         for parameter in (inspect.signature(records[name]).parameters.values() if name in records else [one])
     ]
+    for one in parameters:
+        option = one.annotation.__metadata__[0]
+        if isinstance(option, OptionInfo):
+            option.metavar = option.metavar or _value_name(one.annotation.__origin__)
+            if option.default is ...:  # where typer has the first name
+                option.param_decls = (f"--{one.name.replace('_', '-')}",)
     flat.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
     flat.__annotations__ = {one.name: one.annotation for one in parameters}
     return flat
+
+
+def _value_name(hint: Any) -> str | None:
+    """None for flags and choices."""
+    return VALUE_NAMES.get(hint) or next(filter(None, map(_value_name, get_args(hint))), None)

@@ -1,6 +1,6 @@
 """`segslam replay`, `edit` and `refine`: a new run from the log of another."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from itertools import chain, tee
 from pathlib import Path
@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.checks import check_run, make_room
+from segslam.cli.checks import check_run, make_folder
 from segslam.cli.console import Terminal
 from segslam.cli.ending import finish, is_interrupted
-from segslam.cli.options import WITH_MAP, FoxgloveOption, LogArgument, OverwriteOption, RunSettings, WithMapOption
+from segslam.cli.options import WITH_MAP, FoxgloveOption, LogArgument, RunSettings, WithMapOption
 from segslam.cli.viewers import serve_foxglove
 from segslam.core.errors import SegslamError
 from segslam.core.interrupts import EXIT_STATUS, when_stopped
@@ -32,7 +32,6 @@ def replay(
     out: OutOption,
     changes: RunSettings,
     foxglove: FoxgloveOption = None,
-    overwrite: OverwriteOption = False,
     terminal: Terminal,
 ) -> None:
     """Repeat loop closing and optimisation from the log of a run, with some settings changed.
@@ -41,7 +40,7 @@ def replay(
     """
     check_run(log)
     terminal.announce(f"replay: reading {log}")
-    _replay_log(log, out, changes, terminal, foxglove=foxglove, overwrite=overwrite)
+    _replay_log(log, out, changes, terminal, foxglove=foxglove)
 
 
 def edit(
@@ -59,11 +58,9 @@ def edit(
         ),
     ] = None,
     add_near_fixes: Annotated[
-        bool,
-        typer.Option("--add-near-fixes", help="Add keyframes that the fixes of the run place near each other."),
+        bool, typer.Option(help="Add keyframes that the fixes of the run place near each other.")
     ] = False,
     changes: RunSettings,
-    overwrite: OverwriteOption = False,
     terminal: Terminal,
 ) -> None:
     """Forbid or add loops by hand, and repeat the run with them. Keyframes have the ids of loops.csv and the report.
@@ -74,20 +71,9 @@ def edit(
     Example: segslam edit runs/00 --forbid 120:15 --add 300:40 --out runs/00-edited
     """
     check_run(run)
-    edits = _edits(run, forbid or [], add or [], add_near_fixes=add_near_fixes)
     terminal.announce(f"edit: reading {run}")
-    _check_keyframes(run, edits, terminal)
-
-    from segslam.slam.slam_result import outcome_text
-
-    def after(result: "SlamResult") -> dict[str, Any]:
-        weights = result.estimate.closure_weights
-        outcomes = {attempt.candidate.pair: outcome_text(attempt, weights) for attempt in result.attempts}
-        for pair in sorted(edits.added):
-            terminal.say(f"added {pair[0]}:{pair[1]}: {outcomes.get(pair, 'not tried, because the run ended before')}")
-        return {}
-
-    _replay_log(run, out, changes, terminal, edits=edits, after=after, overwrite=overwrite)
+    edits = _edits(run, forbid or [], add or [], add_near_fixes=add_near_fixes, terminal=terminal)
+    _replay_log(run, out, changes, terminal, edits=edits)
 
 
 def refine(
@@ -96,7 +82,6 @@ def refine(
     out: Annotated[Path, typer.Option(help="New folder for the adjusted run.")],
     with_map: WithMapOption = False,
     changes: RunSettings,
-    overwrite: OverwriteOption = False,
     terminal: Terminal,
 ) -> None:
     """Adjust the whole map of a run: register submaps of its keyframes, and optimise all poses. Its loops are kept.
@@ -106,7 +91,7 @@ def refine(
     check_run(run)
     changes.load()  # reports a wrong setting before the log is read
     terminal.announce(f"refine: reading {run}")
-    from segslam.output.folder import copy_alone, new_folder
+    from segslam.output.folder import copy_alone
     from segslam.run.replay import Replay
     from segslam.slam.slam import Slam
 
@@ -117,8 +102,7 @@ def refine(
     if refined.config.adjustment.max_minutes == 0.0:
         raise SegslamError("adjustment.max_minutes=0: nothing to do; give a limit with --refine-minutes")
     terminal.compile_kernels()
-    make_room(out, overwrite=overwrite, inputs=[run])
-    folder = new_folder(out)
+    folder = make_folder(out, overwrite=changes.overwrite, inputs=[run])
     when_stopped(f"the log in {folder} is kept, without results")
     with refined.begun(folder, Slam(refined.config)) as made:
         steps = made.take((step, 0, False) for step in recorded.whole_steps(len(recorded.keyframes()[0])))
@@ -136,16 +120,21 @@ def _replay_log(
     *,
     foxglove: str | None = None,
     edits: LoopEdits = NO_EDITS,
-    after: "Callable[[SlamResult], dict[str, Any]]" = lambda result: {},
-    overwrite: bool,
 ) -> None:
-    """Repeat a run from its log into a new folder; `edits` follow those of the run.
-
-    `after` returns further figures, from the result. Raises typer.Exit(130) if Ctrl-C ended it early.
-    """
+    """Repeat a run from its log into a new folder; `edits` follow those of the run. Exits if Ctrl-C ended it early."""
     changes.load()  # reports a wrong setting before the log is read
-    from segslam.output.folder import copy_alone, new_folder
+    from segslam.output.folder import copy_alone
     from segslam.run.replay import Replay
+    from segslam.slam.slam_result import outcome_text
+
+    before, now = set[Pair](), set[Pair]()
+
+    def more(result: "SlamResult") -> dict[str, Any]:
+        weights = result.estimate.closure_weights
+        outcomes = {attempt.candidate.pair: outcome_text(attempt, weights) for attempt in result.attempts}
+        for pair in sorted(edits.added):
+            terminal.say(f"added {pair[0]}:{pair[1]}: {outcomes.get(pair, 'not tried, because the run ended before')}")
+        return _compared(recorded, before, now)
 
     replayed = Replay.of(log, config=changes.config, settings=changes.overrides(), edits=edits)
     recorded = replayed.recorded
@@ -157,18 +146,16 @@ def _replay_log(
     terminal.compile_kernels()
     with ExitStack() as stack:
         server = serve_foxglove(foxglove, stack, terminal)
-        make_room(out, overwrite=overwrite, inputs=[log])
-        folder = new_folder(out)
+        folder = make_folder(out, overwrite=changes.overwrite, inputs=[log])
         when_stopped(f"the log in {folder} is kept, without results")
         run = stack.enter_context(replayed.begun(folder, slam, mirror=server.send if server else None))
         copy_alone(recorded.path.parent, folder)
-        before, now = set[Pair](), set[Pair]()
         steps = _repeated(recorded, run, before, now)
         stopped = is_interrupted(terminal.progress(steps, recorded.num_steps(), "replay"))
         if stopped and run.num_steps == 0:
             when_stopped("nothing was written")
             raise typer.Exit(EXIT_STATUS)
-        finish(run, terminal, more=lambda result: _compared(recorded, before, now) | after(result), stopped=stopped)
+        finish(run, terminal, more=more, stopped=stopped)
     if stopped:
         when_stopped(f"{run.num_steps} of {recorded.num_steps()} steps were replayed; results in {folder}")
         raise typer.Exit(EXIT_STATUS)
@@ -202,8 +189,12 @@ def _closures(step: "Step") -> set[Pair]:
     return {outcome.pair for outcome in outcomes if isinstance(outcome, LoopClosure)}
 
 
-def _edits(run: Path, forbid: list[str], add: list[str], *, add_near_fixes: bool) -> LoopEdits:
-    """The edits of the options. Raises SegslamError if there are none."""
+def _edits(run: Path, forbid: list[str], add: list[str], *, add_near_fixes: bool, terminal: Terminal) -> LoopEdits:
+    """The edits of the options.
+
+    Raises SegslamError if there are none, for a keyframe that the run does not have, and for a run localised in a map.
+    A pair that is forbidden but was never tried is reported: it may be a mistyped id.
+    """
     forbidden, added = pairs_of(forbid, "--forbid"), pairs_of(add, "--add")
     if add_near_fixes:
         from segslam.run.replay import pairs_near_fixes
@@ -212,26 +203,18 @@ def _edits(run: Path, forbid: list[str], add: list[str], *, add_near_fixes: bool
     if not forbidden | added:
         remedy = "the fixes propose no further loop" if add_near_fixes else "give --forbid I:J or --add I:J"
         raise SegslamError(f"nothing to edit: {remedy}")
-    return LoopEdits(forbidden, added)
-
-
-def _check_keyframes(run: Path, edits: LoopEdits, terminal: Terminal) -> None:
-    """Raises SegslamError for a keyframe that the run does not have, and for a run localised in a map.
-
-    A pair that is forbidden but was never tried is reported: it may be a mistyped id.
-    """
     from segslam.output.log import read_log
 
     recorded = read_log(run)
     if recorded.options.get("in_map"):
         raise SegslamError(f"{run}: localised in the map of another run, without loops of its own; edit that run")
     num = len(recorded.keyframes()[0])
-    for newer, older in sorted(edits.forbidden | edits.added):
+    for newer, older in sorted(forbidden | added):
         if newer >= num:
             raise SegslamError(f"{newer}:{older}: {run} has keyframes 0 to {num - 1}; the report shows their ids")
-    attempts = chain(
-        (attempt for step in recorded.steps(clouds=False) for attempt in step.attempts), recorded.late_loops()
-    )
+    steps = recorded.steps(clouds=False)
+    attempts = chain((attempt for step in steps for attempt in step.attempts), recorded.late_loops())
     tried = {attempt.candidate.pair for attempt in attempts}
-    for newer, older in sorted(edits.forbidden - tried):
+    for newer, older in sorted(forbidden - tried):
         terminal.say(f"{newer}:{older}: {run} has not tried this loop; forbidden all the same (loops.csv has the ids)")
+    return LoopEdits(forbidden, added)

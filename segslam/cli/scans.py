@@ -1,7 +1,7 @@
 """`segslam label` and `calibrate`: labels of scans, and the error of their vertical angles."""
 
 import logging
-from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,11 +10,11 @@ import typer
 from segslam.cli.checks import check_exists, check_own
 from segslam.cli.console import Terminal
 from segslam.cli.options import EncodingOption, LabelsOption, Numbering, OverwriteOption, ScanOptions, Settings
-from segslam.core.errors import SegslamError
+from segslam.core.errors import BadScan, SegslamError
 
 if TYPE_CHECKING:
     from segslam.scans import Dataset
-    from segslam.slam.adjustment.vertical_angle import Calibrator, VerticalAngle
+    from segslam.slam.adjustment.vertical_angle import VerticalAngle
 
 logger = logging.getLogger(__name__)
 DriveArgument = Annotated[Path, typer.Argument(help="KITTI folder (with sequences/), folder of scans, or recording.")]
@@ -49,7 +49,7 @@ def label(
     angle_deg = changes.load().sensor.vertical_angle_deg
 
     def opened(source: str, numbering: Numbering | None) -> "Dataset":
-        return options.source(data, source, numbering, vertical_angle_deg=angle_deg).open()
+        return replace(options.source(data, source, numbering), vertical_angle_deg=angle_deg).open()
 
     scans = opened(labels, encoding)
     true_scans = None
@@ -111,31 +111,17 @@ def calibrate(
     terminal.announce(f"calibrate: opening {data}")
     from segslam.slam.adjustment.vertical_angle import Calibrator
 
-    opened = scans.source(data, vertical_angle_deg=settings.sensor.vertical_angle_deg).open()
+    opened = replace(scans.source(data), vertical_angle_deg=settings.sensor.vertical_angle_deg).open()
     calibrator = Calibrator(settings)
-    for _ in terminal.progress(_driven(calibrator, opened, distance_m), len(opened), "calibrate"):
-        pass
-    found, applied_deg = calibrator.vertical_angle(), opened.vertical_angle_deg
-    terminal.answer(_figures(found, applied_deg), _summary(found, applied_deg, calibrator.travel_m))
-
-
-def _driven(calibrator: "Calibrator", scans: "Dataset", distance_m: float) -> "Iterator[None]":
-    """Yields after each usable scan, until the drive is long enough."""
-    from segslam.core.types import BadScan
-
-    for scan in scans:
+    for scan in terminal.progress(opened, len(opened), "calibrate"):
         try:
             calibrator.add(scan)
         except BadScan as error:
             logger.warning("%s; skipped", error)
-        yield
         if calibrator.travel_m > distance_m:
-            return
-
-
-def _figures(found: "VerticalAngle | None", applied_deg: float) -> dict[str, Any]:
-    """The figures; null if the angle is unknown."""
-    return {
+            break
+    found, applied_deg = calibrator.vertical_angle(), opened.vertical_angle_deg
+    figures = {
         "vertical_deg": found.angle_deg if found else None,
         "sigma_deg": found.sigma_deg if found else None,
         "num_pairs": found.num_pairs if found else 0,
@@ -143,6 +129,7 @@ def _figures(found: "VerticalAngle | None", applied_deg: float) -> dict[str, Any
         "applied_deg": applied_deg,
         "set_deg": applied_deg + found.angle_deg if found else None,
     }
+    terminal.answer(figures, _summary(found, applied_deg, calibrator.travel_m))
 
 
 def _summary(found: "VerticalAngle | None", applied_deg: float, travel_m: float) -> str:

@@ -5,13 +5,13 @@ from typing import Annotated
 
 import typer
 
-from segslam.cli.checks import check_own, make_room
-from segslam.cli.completion import SENSORS, one_of, simulation_settings
+from segslam.cli.checks import check_own, make_folder
+from segslam.cli.completion import simulation_settings
 from segslam.cli.console import Terminal, how_to_go_on
-from segslam.cli.map import map_scans
-from segslam.cli.options import OverwriteOption
+from segslam.cli.map import map_data
+from segslam.cli.options import GnssOptions, OverwriteOption, RunOptions, RunOutput
 from segslam.core.errors import SegslamError
-from segslam.core.interrupts import EXIT_STATUS, interrupts_wait, same_command_with, when_stopped
+from segslam.core.interrupts import interrupts_wait, same_command_with, when_stopped
 
 SEQUENCE = "00"
 SEED = 33
@@ -37,12 +37,15 @@ def simulate(
     frames: Annotated[int | None, typer.Option(min=1, help="Number of scans; default: the whole drive.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed; the same seed gives the same scans.")] = 0,
     sensor: Annotated[
-        str, typer.Option(autocompletion=one_of(*SENSORS), help="Sensor: hdl64 (as in KITTI), os1-64 or vlp16.")
+        str,
+        typer.Option(
+            autocompletion=lambda: ("hdl64", "os1-64", "vlp16"), help="Sensor: hdl64 (as in KITTI), os1-64 or vlp16."
+        ),
     ] = "hdl64",
     lane: Annotated[
         float, typer.Option(min=-4, max=4, help="Offset to the left of the path (m); negative: to the right.")
     ] = 0.0,
-    reverse: Annotated[bool, typer.Option("--reverse", help="Drive the path in the opposite direction.")] = False,
+    reverse: Annotated[bool, typer.Option(help="Drive the path in the opposite direction.")] = False,
     settings: Annotated[
         list[str] | None,
         typer.Option(
@@ -53,8 +56,7 @@ def simulate(
         ),
     ] = None,
     pairs: Annotated[
-        list[Path] | None,
-        typer.Option("--pairs", help="Write only the scans in this list of pairs; may be repeated."),
+        list[Path] | None, typer.Option(help="Write only the scans in this list of pairs; may be repeated.")
     ] = None,
     sample: Annotated[
         int | None, typer.Option(min=1, help="Use only N pairs of each list, those of `bench --sample N --seed 0`.")
@@ -93,7 +95,7 @@ def simulate(
                     break
     except KeyboardInterrupt:
         when_stopped(f"{last} scans are complete in {out / 'sequences' / sequence}; {begin_again}")
-        raise typer.Exit(EXIT_STATUS) from None
+        raise
     folder, true_poses = out / "sequences" / sequence, out / "poses" / f"{sequence}.txt"
     figures = {"num_scans": last, "sequence": str(folder), "poses": str(true_poses)}
     terminal.answer(figures, f"{last} scans in {folder}, true poses in {true_poses}")
@@ -113,14 +115,11 @@ def demo(
     from segslam.bench.simulation.files import SETTINGS_FILE, prepare_folder, write_drive
     from segslam.bench.simulation.tracks import example_drive
     from segslam.bench.simulation.world_settings import SensorConfig, SimulationConfig
-    from segslam.core.config import Config
     from segslam.core.whole_files import write_whole
-    from segslam.output.folder import new_folder
     from segslam.output.report import BEFORE_AFTER, draw_before_after
-    from segslam.scans import open_dataset
 
-    make_room(out, overwrite=overwrite, made_by=(f"data/sequences/{SEQUENCE}/{SETTINGS_FILE}",))
-    data = new_folder(out) / "data"
+    made_by = (f"data/sequences/{SEQUENCE}/{SETTINGS_FILE}",)
+    data = make_folder(out, overwrite=overwrite, made_by=made_by) / "data"
     begin_again = f"to start again: {same_command_with('--overwrite')}"
     when_stopped(begin_again)
     sensor = SensorConfig(name=SENSOR, axis_wander_sigma_deg=AXIS_WANDER_DEG, axis_wander_s=AXIS_WANDER_S)
@@ -131,8 +130,8 @@ def demo(
     with how_to_go_on(begin_again):
         for _ in terminal.progress(written, len(drive.time_s), "simulate"):
             pass
-    scans = open_dataset(data, sequence=SEQUENCE, labels="geometric")
-    map_scans(scans, out / "run", terminal, settings=Config(), go_on=begin_again)
+    options = RunOptions(labels="geometric", preset="driving")
+    map_data(data, out / "run", options, RunOutput(), terminal, GnssOptions(), go_on=begin_again)
     picture = out / "run" / BEFORE_AFTER
     write_whole(picture, draw_before_after(out / "run"))
     terminal.say(f"map before and after loop closing: {picture}")

@@ -4,7 +4,7 @@ import csv
 import io
 import shutil
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -31,25 +31,29 @@ Rows = Mapping[str, Mapping[str, Any]]
 """Name -> figures."""
 
 
-def figure(value: float) -> str:
-    """Whole numbers in full, others with four digits."""
-    return str(value) if isinstance(value, int) else f"{value:.4g}"
+def with_meanings(columns: Sequence[Mapping[str, Any]], meanings: Mapping[str, str], *, width: int = 10) -> str:
+    """A line for each figure of any column: whole numbers in full, others with four digits, `-` for missing ones.
 
-
-def with_meaning(cells: str, meaning: str) -> str:
-    """Figures and, beside them, their meaning, wrapped to the width of the terminal."""
-    indent = " " * (len(cells) + 2)
-    width = max(shutil.get_terminal_size().columns, len(indent) + 16)  # on a narrow terminal, too
-    return textwrap.fill(meaning, width, initial_indent=f"{cells}  ", subsequent_indent=indent)
+    The meaning beside them is wrapped to the width of the terminal.
+    """
+    lines = []
+    for key, meaning in meanings.items():
+        values = [column.get(key) for column in columns]
+        if any(value is not None for value in values):
+            shown = ("-" if one is None else str(one) if isinstance(one, int) else f"{one:.4g}" for one in values)
+            cells = "".join(f"{cell:>{width}}" for cell in shown) + "  "
+            fits = max(shutil.get_terminal_size().columns, len(cells) + 16)  # on a narrow terminal, too
+            lines.append(textwrap.fill(meaning, fits, initial_indent=cells, subsequent_indent=" " * len(cells)))
+    return "\n".join(lines)
 
 
 @dataclass(frozen=True)
 class TableFiles:
     """Options of commands with a table."""
 
-    csv: Annotated[Path | None, typer.Option("--csv", help="Write the table to this file, a row for each.")] = None
+    csv: Annotated[Path | None, typer.Option(help="Write the table to this file, a row for each.")] = None
     latex: Annotated[
-        Path | None, typer.Option("--latex", help="Write the table to this file as a LaTeX tabular, a row for each.")
+        Path | None, typer.Option(help="Write the table to this file as a LaTeX tabular, a row for each.")
     ] = None
 
     def write(self, rows: Rows) -> None:
@@ -80,24 +84,19 @@ def as_latex(rows: Rows) -> str:
     return "\n".join([*parts, ""])
 
 
-def as_text(rows: Rows, *, within: int | None = None) -> str:
-    """The columns of `SHORT`, aligned; those that do not fit `within` characters (of the terminal) follow below."""
-    within = within or shutil.get_terminal_size().columns
+def as_text(rows: Rows) -> str:
+    """The columns of `SHORT`, aligned; those that do not fit the terminal follow below."""
+    within = shutil.get_terminal_size().columns
     first = max(map(len, rows), default=4)
-    parts: list[list[tuple[str, int]]] = [[]]
+    names = [f"{name:<{first}}" for name in ("", *rows)]
+    parts = [names]
     for key in _columns(rows):
         width = max(len(SHORT[key]), 7)
-        if parts[-1] and first + sum(2 + w for _, w in parts[-1]) + 2 + width > within:
-            parts.append([])
-        parts[-1].append((key, width))
-    return "\n\n".join(_aligned(rows, columns, first) for columns in parts)
-
-
-def _aligned(rows: Rows, columns: list[tuple[str, int]], first: int) -> str:
-    lines = [" " * first + "".join(f"  {SHORT[key]:>{width}}" for key, width in columns)]
-    for name, row in rows.items():
-        lines.append(f"{name:<{first}}" + "".join(f"  {_cell(row.get(key)):>{width}}" for key, width in columns))
-    return "\n".join(lines)
+        if parts[-1] is not names and len(parts[-1][0]) + 2 + width > within:
+            parts.append(names)
+        cells = (SHORT[key], *(_cell(row.get(key)) for row in rows.values()))
+        parts[-1] = [f"{line}  {cell:>{width}}" for line, cell in zip(parts[-1], cells, strict=True)]
+    return "\n\n".join("\n".join(lines) for lines in parts)
 
 
 def _columns(rows: Rows) -> list[str]:

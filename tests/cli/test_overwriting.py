@@ -8,7 +8,7 @@ from helpers.commands import run
 from helpers.drives import write_kitti_sequence
 from helpers.finished_run import make_run
 
-from segslam.cli.checks import make_room
+from segslam.cli.checks import make_folder
 from segslam.core.errors import SegslamError
 from segslam.output.log import read_log
 from segslam.output.log.writer import Output
@@ -81,15 +81,16 @@ def test_only_a_finished_run_that_is_no_input_is_removed(made: Path, tmp_path: P
     other.mkdir()
     (other / "me.jpg").touch()
     with pytest.raises(SegslamError, match="does not remove it"):
-        make_room(other, overwrite=True)
+        make_folder(other, overwrite=True)
     with pytest.raises(SegslamError, match="contains the input"):
-        make_room(made, overwrite=True, inputs=[made / "log.mcap"])
-    make_room(made, overwrite=False)
-    make_room(tmp_path / "new", overwrite=True)
+        make_folder(made, overwrite=True, inputs=[made / "log.mcap"])
+    with pytest.raises(SegslamError, match="not empty"):
+        make_folder(made, overwrite=False)
+    assert make_folder(tmp_path / "new", overwrite=True).is_dir()
     run_folder = tmp_path / "now"
     run_folder.mkdir()
     with closing(Output(run_folder / "log.mcap")), pytest.raises(SegslamError, match="in progress"):
-        make_room(run_folder, overwrite=True)
+        make_folder(run_folder, overwrite=True)
     assert (other / "me.jpg").exists()
     assert (made / "log.mcap").exists()
 

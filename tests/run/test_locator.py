@@ -149,6 +149,16 @@ def test_bad_usage_of_the_command_is_one_line(
     assert output in capsys.readouterr().err
 
 
+def test_labels_of_unknown_numbering_are_refused_with_the_remedy(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points = round_drive()[0][55].points
+    np.save(tmp_path / "a.npy", points)
+    np.zeros(len(points), "<u4").tofile(tmp_path / "a.label")
+    assert commands.run("locate", run, tmp_path / "a.npy", "--labels", tmp_path) == 2
+    assert "pass --encoding" in capsys.readouterr().err
+
+
 def test_labels_of_another_number_are_refused(run: Path) -> None:
     points = round_drive()[0][55].points
     with pytest.raises(SegslamError, match=f"3 labels for {len(points)} points"):

@@ -16,8 +16,6 @@ from segslam.scans.ply import parse_ply
 from segslam.scans.scan_files import INTENSITY_FIELDS, NO_POINTS, TIME_FIELDS, Columns, read_bytes
 
 SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
-TIMES = (*TIME_FIELDS, "timestamps", "stamps")
-"""Names of the field with the time of a point; the first that exists is used."""
 MAX_NPY_HEADER_BYTES = 10_000
 """As in NumPy: a longer header can make Python's parser fail."""
 
@@ -35,9 +33,9 @@ def read_file(file: Path) -> Cloud:
             case ".npy":
                 return _from_rows(_parse_npy(read_bytes(file)))
             case ".ply":
-                return _from_columns(parse_ply(read_bytes(file)))
+                return from_columns(parse_ply(read_bytes(file)))
             case ".pcd":
-                return _from_columns(parse_pcd(read_bytes(file)))
+                return from_columns(parse_pcd(read_bytes(file)))
             case other:
                 raise SegslamError(f"{file}: unknown format {other or '(no extension)'}; give .bin, .npy, .ply or .pcd")
     except (ValueError, MemoryError) as error:
@@ -83,8 +81,8 @@ def _from_rows(rows: np.ndarray) -> Cloud:
     return Cloud(rows[:, :3], np.empty(0), rows[:, 3] if rows.shape[1] > 3 else None)
 
 
-def _from_columns(columns: Columns) -> Cloud:
-    """Raises ValueError without x, y and z."""
+def from_columns(columns: Columns) -> Cloud:
+    """The cloud of named fields, (n,) each. Raises ValueError without x, y and z."""
     if not {"x", "y", "z"} <= set(columns):
         raise ValueError(f"it has no fields x y z, only {' '.join(columns)[:80] or 'none'}")
     axes = [columns[axis] for axis in "xyz"]
@@ -92,7 +90,7 @@ def _from_columns(columns: Columns) -> Cloud:
     for k, axis in enumerate(axes):
         points[:, k] = axis
     intensities = next((columns[name] for name in INTENSITY_FIELDS if name in columns), None)
-    times = next((columns[name] for name in TIMES if name in columns), np.empty(0))
+    times = next((columns[name] for name in TIME_FIELDS if name in columns), np.empty(0))
     return Cloud(
         points, times.astype(np.float64), None if intensities is None else intensities.astype(_kind(intensities))
     )

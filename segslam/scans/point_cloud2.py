@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from segslam.scans.clouds import from_columns
 from segslam.scans.dataset import Cloud
-from segslam.scans.scan_files import INTENSITY_FIELDS, TIME_FIELDS
 
 KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Types of sensor_msgs/PointField by number."""
@@ -45,15 +45,8 @@ def read_message(message: Any) -> Cloud:
     Raises KeyError, TypeError or ValueError for an inconsistent message or one without x, y, z.
     """
     rows = _rows(message)
-    points = np.column_stack([rows[axis].ravel() for axis in "xyz"]).astype(np.float64)
-    intensity = next((name for name in INTENSITY_FIELDS if name in (rows.dtype.names or ())), None)
-    time = next((field.name for field in message.fields if field.name in TIME_FIELDS), None)
-    return Cloud(
-        points,
-        rows[time].ravel().astype(np.float64) if time else np.empty(0),
-        rows[intensity].ravel().astype(np.float64) if intensity else None,
-        stamp_ns_of(message),
-    )
+    cloud = from_columns({name: rows[name].ravel() for name in rows.dtype.names or ()})
+    return replace(cloud, stamp_ns=stamp_ns_of(message))
 
 
 def stamp_ns_of(message: Any) -> int:

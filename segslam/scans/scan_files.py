@@ -19,8 +19,11 @@ MAX_SCAN_BYTES = 2**30
 """Largest file that is read as one scan. Chosen: 60 million points of 16 bytes, 200 times the largest known sweep."""
 MAX_HEADER_BYTES = 65_536
 """Largest header in which its last line is searched. Chosen: 1,000 comments; usual headers have 300 bytes."""
-TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time")
-"""Names that drivers (Ouster, Velodyne, Hesai, Robosense, Livox) use for the time of a point, in any unit."""
+TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "timestamps", "stamps")
+"""Names that drivers (Ouster, Velodyne, Hesai, Robosense, Livox) and programs use for the time of a point, in any unit.
+
+The first that exists is used.
+"""
 INTENSITY_FIELDS = ("intensity", "reflectivity", "signal")
 """Names that drivers and programs use for the intensity; the first that exists is used."""
 UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)

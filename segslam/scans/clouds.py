@@ -1,13 +1,13 @@
 """Single scans from files: .bin, .npy, .ply, .pcd. All commands read them here."""
 
-import ast
 import math
-import re
-import struct
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+from numpy.lib import format as npy
 
+from segslam.core.errors import brief
 from segslam.core.types import BadScan, SegslamError
 from segslam.scans.dataset import Cloud
 from segslam.scans.kitti import read_returns
@@ -16,8 +16,6 @@ from segslam.scans.ply import parse_ply
 from segslam.scans.scan_files import INTENSITY_FIELDS, NO_POINTS, TIME_FIELDS, Columns, read_bytes
 
 SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
-MAX_NPY_HEADER_BYTES = 10_000
-"""As in NumPy: a longer header can make Python's parser fail."""
 
 
 def read_file(file: Path) -> Cloud:
@@ -49,30 +47,21 @@ def _parse_npy(content: bytes) -> np.ndarray:
 
     Raises ValueError for another content, and for a file whose size is not that of the array.
     """
-    if not content.startswith(b"\x93NUMPY") or len(content) < 12:
-        raise ValueError("it is not a .npy file; save an array by numpy.save")
-    size, start = ("<H", 10) if content[6] == 1 else ("<I", 12)
-    (num_header,) = struct.unpack_from(size, content, 8)
-    if num_header > MAX_NPY_HEADER_BYTES or start + num_header > len(content):
-        raise ValueError("its header is damaged or truncated")
+    stream = BytesIO(content)
     try:
-        header = ast.literal_eval(content[start : start + num_header].decode("latin-1").strip())
-    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError) as error:
-        raise ValueError(f"its header is damaged ({type(error).__name__})") from error
-    match header:
-        case {"descr": str(kind), "fortran_order": bool(by_columns), "shape": (int(rows), int(columns))}:
-            pass
-        case _:
-            raise ValueError("its array is not of the shape (n, 3) or more, or not of plain numbers, x y z")
-    if not re.fullmatch(r"[<>|=]?[fiu][1248]", kind) or kind[-2:] == "f1" or columns < 3 or rows < 0:
-        raise ValueError(f"it contains {kind[:20]} of shape ({rows}, {columns}); expected (n, 3) numbers, x y z")
-    start += num_header
-    num_bytes = len(content) - start
-    if num_bytes != math.prod((rows, columns, np.dtype(kind).itemsize)):
-        raise ValueError(f"its header claims {rows} x {columns} {kind}, but {num_bytes} bytes follow: truncated")
-    if rows == 0:
+        is_first = npy.read_magic(stream) == (1, 0)
+        shape, by_columns, kind = (npy.read_array_header_1_0 if is_first else npy.read_array_header_2_0)(stream)
+    except Exception as error:  # of NumPy's parser, which raises many kinds
+        what = brief(f"{type(error).__name__}: {error}")
+        raise ValueError(f"it is not a .npy file, or its header is damaged ({what}); save it by numpy.save") from error
+    if len(shape) != 2 or shape[0] < 0 or shape[1] < 3 or kind.kind not in "fiu" or kind.itemsize > 8:
+        raise ValueError(f"it contains {brief(f'{kind} of shape {shape}')}; expected (n, 3) numbers, x y z")
+    num_bytes = len(content) - stream.tell()
+    if num_bytes != math.prod(shape) * kind.itemsize:
+        raise ValueError(f"its header claims {shape} {kind}, but {num_bytes} bytes follow: truncated")
+    if shape[0] == 0:
         raise ValueError(NO_POINTS)
-    return np.frombuffer(content, kind, offset=start).reshape((rows, columns), order="F" if by_columns else "C")
+    return np.frombuffer(content, kind, offset=stream.tell()).reshape(shape, order="F" if by_columns else "C")
 
 
 def _from_rows(rows: np.ndarray) -> Cloud:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core import geometry
 from segslam.core.trajectory import Poses, travelled_m
-from segslam.core.types import IndexPairs, Mask, Points, Transform, Vector
+from segslam.core.types import IndexPairs, Indices, Mask, Points, Transform, Vector
 
 Z_UP = (0.0, 0.0, 1.0)
 """Upward axis of LiDAR frames."""
@@ -85,7 +85,7 @@ def trajectory_metrics(estimate: Poses, reference: Poses, *, up: tuple[float, fl
     T_reference_estimate = align_positions(estimate[:, :3, 3], reference[:, :3, 3])
     aligned = T_reference_estimate @ estimate
     absolute = pose_errors(aligned, reference)
-    relative = relative_errors(estimate, reference)
+    relative = motion_errors(estimate, reference, np.s_[:-1], np.s_[1:])
     ate_m = rms(absolute.translation_m)
     metrics = {
         "ate_m": ate_m,
@@ -141,9 +141,9 @@ def pose_errors(estimate: Poses, reference: Poses) -> PoseErrors:
     return PoseErrors(np.linalg.norm(difference[:, :3, 3], axis=1), np.degrees(angles))
 
 
-def relative_errors(estimate: Poses, reference: Poses) -> PoseErrors:
-    """Errors of the motion from each row to the next, one row fewer than the poses."""
-    motions = (np.linalg.inv(poses[:-1]) @ poses[1:] for poses in (estimate, reference))
+def motion_errors(estimate: Poses, reference: Poses, starts: Indices | slice, ends: Indices | slice) -> PoseErrors:
+    """Errors of the motions between rows."""
+    motions = (np.linalg.inv(poses[starts]) @ poses[ends] for poses in (estimate, reference))
     return pose_errors(*motions)
 
 
@@ -157,8 +157,7 @@ def segment_errors(estimate: Poses, reference: Poses) -> PoseErrors:
     ends = np.searchsorted(travel_m, travel_m[starts] + lengths, side="right")
     inside = ends < len(reference)
     starts, ends, lengths = starts[inside], ends[inside], lengths[inside]
-    motions = (np.linalg.inv(poses[starts]) @ poses[ends] for poses in (estimate, reference))
-    errors = pose_errors(*motions)
+    errors = motion_errors(estimate, reference, starts, ends)
     return PoseErrors(errors.translation_m / lengths, errors.rotation_deg / lengths)
 
 

@@ -5,7 +5,16 @@ from typing import Literal
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.evaluation import MIN_POSES, Z_UP, align_positions, loop_metrics, pose_errors, rms, trajectory_metrics
+from segslam.core.evaluation import (
+    MIN_POSES,
+    Z_UP,
+    align_positions,
+    loop_metrics,
+    motion_errors,
+    pose_errors,
+    rms,
+    trajectory_metrics,
+)
 from segslam.core.trajectory import Poses, nearest_rows, rows_of_same_scan, travelled_m
 from segslam.core.types import IndexPairs, LoopClosure, Points, Trajectory
 from segslam.output.folder import ALONE
@@ -128,8 +137,7 @@ def _over_distance(estimate: Poses, reference: Poses, distance_m: float) -> dict
     pairs = pairs_at_distance(reference, distance_m)
     if len(pairs) == 0:
         return {}
-    motions = (np.linalg.inv(poses[pairs[:, 0]]) @ poses[pairs[:, 1]] for poses in (estimate, reference))
-    errors_m = pose_errors(*motions).translation_m
+    errors_m = motion_errors(estimate, reference, *pairs.T).translation_m
     return {
         "rpe_distance_m": distance_m,
         "rpe_over_distance_m": rms(errors_m),

@@ -82,11 +82,6 @@ def radius_neighbours(points: Points, radius_m: float) -> Neighbours:
     return Neighbours(*_neighbours(points.astype(np.float64)[order], keys[order], *strides, order, radius_m**2))
 
 
-def patch_covariances(points: Points, neighbours: Neighbours) -> Covariances:
-    """Covariance (normalised by n) of the neighbours of each point, itself among them."""
-    return _patch_covariances(points.astype(np.float64), *neighbours)
-
-
 def normals(points: Points, covariances: Covariances) -> Points:
     """Normal (n, 3) of each point: direction of least variance in its patch, towards the sensor at the origin.
 
@@ -181,27 +176,19 @@ def first_rows(keys):
     return first
 
 
-@kernel("int64[:, :](int64[:], int64, int64, int64)")
-def _nearby_columns(keys, key, stride_x, stride_y):
-    """(9, 2) first and last + 1 row, in sorted keys, of the cells around a cell, in columns of three along z."""
-    bounds = np.empty((9, 2), np.int64)
-    for column in range(9):
-        middle = key + (column // 3 - 1) * stride_x + (column % 3 - 1) * stride_y
-        bounds[column, 0] = np.searchsorted(keys, middle - 1)
-        bounds[column, 1] = np.searchsorted(keys, middle + 2)
-    return bounds
-
-
 @kernel("Tuple((int64[:], int64[:], int32[:]))(float64[:, :], int64[:], int64, int64, int64[:], float64)")
 def _neighbours(points, keys, stride_x, stride_y, row_of, squared_radius):
     """Neighbours of points sorted by key; `row_of` contains the original row of each point."""
     starts, ends = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
     rows = np.empty(64 * len(points) + 1, np.int32)
-    bounds = np.empty((9, 2), np.int64)
+    bounds = np.empty((9, 2), np.int64)  # rows of the cells around the point's own, in columns of three along z
     count = 0
     for at in range(len(points)):
         if at == 0 or keys[at] != keys[at - 1]:
-            bounds = _nearby_columns(keys, keys[at], stride_x, stride_y)
+            for column in range(9):
+                middle = keys[at] + (column // 3 - 1) * stride_x + (column % 3 - 1) * stride_y
+                bounds[column, 0] = np.searchsorted(keys, middle - 1)
+                bounds[column, 1] = np.searchsorted(keys, middle + 2)
         starts[row_of[at]] = count
         for column in range(9):
             while count + bounds[column, 1] - bounds[column, 0] >= len(rows):
@@ -217,7 +204,8 @@ def _neighbours(points, keys, stride_x, stride_y, row_of, squared_radius):
 
 
 @kernel("float64[:, :, :](float64[:, :], int64[:], int64[:], int32[:])")
-def _patch_covariances(points, starts, ends, rows):
+def patch_covariances(points, starts, ends, rows):
+    """Covariance (normalised by n) of the `Neighbours` of each point, itself among them."""
     covariances = np.empty((len(points), 3, 3))
     for row in range(len(points)):
         sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0

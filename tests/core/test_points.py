@@ -122,7 +122,7 @@ def test_no_points_have_no_neighbours() -> None:
 
 def test_patch_covariances_are_numpys() -> None:
     points = cloud(3)
-    covariances = patch_covariances(points, radius_neighbours(points, 1.5))
+    covariances = patch_covariances(points, *radius_neighbours(points, 1.5))
     for row, inside in enumerate(cKDTree(points).query_ball_point(points, 1.5)):
         np.testing.assert_allclose(covariances[row], np.cov(points[inside].T, bias=True), atol=1e-12)
 
@@ -132,7 +132,7 @@ def test_normals_of_walls_face_the_sensor() -> None:
     for direction in (np.array([1.0, 0, 0]), np.array([0, -0.6, 0.8])):
         along = np.linalg.svd(direction[None])[2][1:]
         wall = side @ along + 8.0 * direction
-        covariances = patch_covariances(wall, radius_neighbours(wall, 2.0))
+        covariances = patch_covariances(wall, *radius_neighbours(wall, 2.0))
         np.testing.assert_allclose(normals(wall, covariances), np.tile(-direction, (len(wall), 1)), atol=1e-9)
 
 

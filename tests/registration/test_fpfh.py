@@ -90,7 +90,7 @@ def test_neighbour_histograms_are_those_of_the_point_cloud_library(data_dir, clo
     """
     with np.load(data_dir / "golden" / "000000_004413_asis.npz") as arrays:
         points, theirs = arrays[f"{cloud}_vox"].astype(float), arrays[f"{cloud}_fpfh"]
-    covariances = patch_covariances(points, radius_neighbours(points, 1.0))
+    covariances = patch_covariances(points, *radius_neighbours(points, 1.0))
     around = radius_neighbours(points, RADIUS_M)
     simple = simple_histograms(points, normals(points, covariances), *around, np.ones(len(points), bool))
     chosen = np.argsort(around.starts - around.ends, kind="stable")[:500]

@@ -116,7 +116,7 @@ def _class_features(cloud: Points, label: int, config: SegregatorConfig) -> Feat
     """The key points of one class from its voxelised cloud; none if no point has enough neighbours."""
     patches = radius_neighbours(cloud, config.normal_radius_m)
     kept = patches.ends - patches.starts >= MIN_PATCH_POINTS
-    covariances = patch_covariances(cloud, patches)[kept]
+    covariances = patch_covariances(cloud, *patches)[kept]
     cloud = cloud[kept]
     around = radius_neighbours(cloud, config.feature_radius_m)
     chosen = np.sort(np.argsort(around.starts - around.ends, kind="stable")[: config.max_features_per_class])

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, update_wrapper
 from importlib import import_module
 from importlib.metadata import version
@@ -94,9 +94,20 @@ def build(modules: Sequence[str] = MODULES) -> Iterator[str]:
     from_processes, pipe = os.pipe()
     processes = [_start(modules, pipe, backwards=backwards) for backwards in (False, True)]
     os.close(pipe)
+    total, done, others = num_kernels(modules), set[str](), list[str]()
     try:
         with open(from_processes, encoding="utf-8", errors="replace") as lines:
-            yield from _names_of_done(lines, num_kernels(modules))
+            for line in map(str.strip, lines):
+                name = line.removeprefix(DONE)
+                if name == line:
+                    others.append(line)
+                elif name not in done:
+                    done.add(name)
+                    yield name
+                if len(done) == total:
+                    break
+            else:
+                raise RuntimeError(f"the kernels were not compiled: {' '.join(others[-3:]) or 'a process was stopped'}")
     finally:
         for process in processes:
             process.kill()  # no effect on a process that has ended
@@ -186,22 +197,6 @@ def _start(modules: Sequence[str], pipe: int, *, backwards: bool) -> subprocess.
         stderr=subprocess.STDOUT,
         env=os.environ | {"PYTHONPATH": path},
     )
-
-
-def _names_of_done(lines: Iterable[str], total: int) -> Iterator[str]:
-    """Name of each kernel on its first report, until there are `total`."""
-    done: set[str] = set()
-    others: list[str] = []
-    for line in map(str.strip, lines):
-        name = line.removeprefix(DONE)
-        if name == line:
-            others.append(line)
-        elif name not in done:
-            done.add(name)
-            yield name
-        if len(done) == total:
-            return
-    raise RuntimeError(f"the kernels were not compiled: {' '.join(others[-3:]) or 'a process was stopped'}")
 
 
 def _build(modules: Sequence[str], *, backwards: bool) -> None:

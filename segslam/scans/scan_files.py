@@ -6,7 +6,6 @@ All parsers raise ValueError with what is wrong.
 import os
 import stat
 from collections.abc import Iterable, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -92,17 +91,12 @@ def binary_columns(
     content: bytes | memoryview, start: int, num_rows: int, fields: Sequence[Field], *, is_last: bool
 ) -> Columns:
     """The fields of rows that follow one another, as views; `is_last`: nothing follows the rows."""
-    ends = np.cumsum([0, *(field.dtype.itemsize * field.num_values for field in fields)]).tolist()
-    row_bytes = ends[-1]
-    check_size(len(content) - start, num_rows * row_bytes, num_rows, tolerated=row_bytes - 1 if is_last else None)
+    row = np.dtype([(f"{k}", field.dtype, (field.num_values,)) for k, field in enumerate(fields)])
+    check_size(len(content) - start, num_rows * row.itemsize, num_rows, tolerated=row.itemsize - 1 if is_last else None)
     if num_rows == 0:
         raise ValueError(NO_POINTS)
-    rows = np.frombuffer(content, np.uint8, num_rows * row_bytes, start).reshape(num_rows, row_bytes)
-    return _by_name(
-        (field.name, rows[:, begin:end].view(field.dtype)[:, 0])
-        for field, (begin, end) in zip(fields, pairwise(ends), strict=True)
-        if field.num_values == 1
-    )
+    rows = np.frombuffer(content, row, num_rows, start)
+    return _by_name((field.name, rows[f"{k}"][:, 0]) for k, field in enumerate(fields) if field.num_values == 1)
 
 
 def text_columns(content: bytes, start: int, num_rows: int, fields: Sequence[Field], *, is_last: bool) -> Columns:

@@ -188,11 +188,11 @@ def make_scan(
     )
 
 
-def check_num_poses(file: Path, num_poses: int, num_recorded: int) -> None:
-    """Raises SegslamError if a pose file, one line per scan, has another number of lines than the data has scans."""
-    if num_poses != num_recorded:
+def check_num_lines(file: Path, num_lines: int, num_recorded: int) -> None:
+    """Raises SegslamError if a file of poses or times has another number of them than the data has scans."""
+    if num_lines != num_recorded:
         raise SegslamError(
-            f"{file}: {num_poses} poses, but the data has {num_recorded} scans; it must have one line per scan, line "
+            f"{file}: {num_lines} lines, but the data has {num_recorded} scans; it must have one line per scan, line "
             "n + 1 for scan n. Correct or remove the file"
         )
 

@@ -14,7 +14,7 @@ from segslam.core.errors import brief, unreadable
 from segslam.core.trajectory import ROTATION_TOLERANCE, lidar_from_camera, read_poses
 from segslam.core.types import BadScan, Indices, SegslamError, Trajectory, Transform
 from segslam.labels.label_files import open_labels
-from segslam.scans.dataset import Cloud, Dataset, DataSource, check_num_poses, read_stamps, selected_rows
+from segslam.scans.dataset import Cloud, Dataset, DataSource, check_num_lines, read_stamps, selected_rows
 from segslam.scans.scan_files import read_bytes
 
 VERTICAL_ANGLE_DEG = 0.205
@@ -56,7 +56,7 @@ class KittiSequence(Dataset):
         self.reference = None
         if poses_file.exists():
             poses = lidar_from_camera(read_poses(poses_file, format="kitti").T_a_b, self.T_camera_lidar)
-            check_num_poses(poses_file, len(poses), len(stamps))
+            check_num_lines(poses_file, len(poses), len(stamps))
             self.reference = Trajectory(self.scan_index, self.stamp_ns, poses[self.scan_index])
         self.vertical_angle_deg = VERTICAL_ANGLE_DEG if source.vertical_angle_deg is None else source.vertical_angle_deg
         self._has_intensities = source.intensities

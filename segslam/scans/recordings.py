@@ -23,7 +23,7 @@ from segslam.scans.dataset import (
     Cloud,
     Dataset,
     DataSource,
-    check_num_poses,
+    check_num_lines,
     no_topics,
     read_stamps,
     selected_rows,
@@ -54,27 +54,27 @@ class Recording(Dataset):
         self.vertical_angle_deg = source.vertical_angle_deg or 0.0
         self.is_sequential = bool(getattr(self._loader, "is_sequential", False))
         self.num_recorded = len(self._loader)
-        self._stamps = None
+        self._stamps = np.arange(self.num_recorded) * ASSUMED_PERIOD_NS
         times_file = beside / "times.txt"
         if kind == "generic" and times_file.exists():
             self._stamps = read_stamps(times_file)
-            if len(self._stamps) != self.num_recorded:
-                what = f"{len(self._stamps)} lines for {self.num_recorded} scans"
-                raise SegslamError(f"{times_file}: {what}; correct or remove the file")
+            check_num_lines(times_file, len(self._stamps), self.num_recorded)
+        elif hasattr(self._loader, "get_frames_timestamps"):
+            times_s = np.asarray(self._loader.get_frames_timestamps(), dtype=float)
+            self._stamps = np.rint(times_s.ravel() * 1e9).astype(np.int64)
         self.scan_index = selected_rows(np.arange(self.num_recorded), source.frames, self._source)
         self.names = [self._file(int(index)).stem for index in self.scan_index]
         self.labels = open_labels(source.labels, beside=beside, scan_names=self.names, encoding=source.encoding)
         poses_file = beside / "poses.txt"
         if kind == "generic" and poses_file.exists():
             poses = read_poses(poses_file, format="kitti").T_a_b
-            check_num_poses(poses_file, len(poses), self.num_recorded)
+            check_num_lines(poses_file, len(poses), self.num_recorded)
         else:
             poses = np.asarray(getattr(self._loader, "gt_poses", np.empty((0, 4, 4))), dtype=float)
         self.reference = None
         posed = self.scan_index[self.scan_index < len(poses)]
         if len(posed):
-            stamp_ns = np.array([self._stamp_ns(index) for index in posed.tolist()])
-            self.reference = Trajectory(posed, stamp_ns, poses[posed])
+            self.reference = Trajectory(posed, self._stamps[posed], poses[posed])
 
     def _read(self, row: int) -> tuple[Path, int, Cloud]:
         """As in the base class; readers of kiss_icp give points, or points and times."""
@@ -97,19 +97,10 @@ class Recording(Dataset):
             raise
         except FOREIGN_ERRORS as error:
             raise BadScan(f"{file}: the scan cannot be read ({_reason(error)})") from error
-        stamp_ns = self._stamp_ns(index, cloud)
+        stamp_ns = int(self._stamps[index]) if cloud.stamp_ns is None else cloud.stamp_ns
         if abs(stamp_ns) >= 2**63:
             raise BadScan(f"{file}: its stamp {stamp_ns} ns is more than 292 years; correct the sensor's clock")
         return file, stamp_ns, cloud
-
-    def _stamp_ns(self, index: int, cloud: Cloud | None = None) -> int:
-        if self._stamps is not None:
-            return int(self._stamps[index])
-        if cloud is not None and cloud.stamp_ns is not None:
-            return cloud.stamp_ns
-        if not hasattr(self._loader, "get_frames_timestamps"):
-            return index * ASSUMED_PERIOD_NS
-        return round(float(np.squeeze(self._loader.get_frames_timestamps()[index])) * 1e9)
 
     def _file(self, index: int) -> Path:
         """The file of a scan; a name with its number for recordings of many scans."""

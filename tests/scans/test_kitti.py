@@ -121,7 +121,7 @@ def test_without_poses_there_is_no_reference(tmp_path: Path) -> None:
 def test_poses_of_another_length_than_the_times_are_refused(tmp_path: Path) -> None:
     _write_sequence(tmp_path, [0, 1, 4])
     (tmp_path / "poses" / "03.txt").write_text(f"{_line(np.eye(4))}\n" * 2)
-    with pytest.raises(SegslamError, match=r"03\.txt: 2 poses, but the data has 5 scans; it must have one line"):
+    with pytest.raises(SegslamError, match=r"03\.txt: 2 lines, but the data has 5 scans; it must have one line"):
         _open(tmp_path)
 
 

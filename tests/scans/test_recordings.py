@@ -120,7 +120,7 @@ def test_recording_read_in_order_gives_the_requested_scan(monkeypatch: pytest.Mo
 def test_times_of_another_number_are_refused(tmp_path: Path) -> None:
     folder = _write_clouds(tmp_path / "drive", 3)
     (folder / "times.txt").write_text("0\n1\n")
-    with pytest.raises(SegslamError, match=r"times\.txt: 2 lines for 3 scans"):
+    with pytest.raises(SegslamError, match=r"times\.txt: 2 lines, but the data has 3 scans"):
         open_dataset(folder)
 
 
@@ -193,7 +193,7 @@ def test_poses_of_another_number_than_the_scans_are_refused(tmp_path: Path) -> N
     for number in range(4):
         np.ones((10, 4), np.float32).tofile(tmp_path / f"{number}.bin")
     write_kitti(tmp_path / "poses.txt", np.tile(np.eye(4), (2, 1, 1)))
-    with pytest.raises(SegslamError, match=r"poses\.txt: 2 poses, but the data has 4"):
+    with pytest.raises(SegslamError, match=r"poses\.txt: 2 lines, but the data has 4"):
         open_dataset(tmp_path)
 
 

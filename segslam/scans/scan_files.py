@@ -151,7 +151,7 @@ def _by_name(columns: Iterable[tuple[str, np.ndarray]]) -> Columns:
     return named
 
 
-def sweep_times(times: np.ndarray, num_points: int, stamp_s: float | None = None) -> Vector:
+def sweep_times(times: np.ndarray, num_points: int, stamp_s: float) -> Vector:
     """Time (n,) of each point: 0 at the start of the sweep, 1 at its end.
 
     `times` (n,) may count from the start of the sweep, up to its end (negative), or absolutely with the start
@@ -170,8 +170,7 @@ def sweep_times(times: np.ndarray, num_points: int, stamp_s: float | None = None
         for period in (period_s / unit_s for period_s in PERIODS_S):
             if not (1.0 - LONGEST_SEAM) * period <= last - first <= (1.0 + JITTER) * period:
                 continue
-            absolute = () if stamp_s is None else (stamp_s / unit_s,)
-            for start in (0.0, -period, *absolute):
+            for start in (0.0, -period, stamp_s / unit_s):
                 if start - JITTER * period <= first and last <= start + (1.0 + JITTER) * period:
                     return np.clip((times - start) / period, 0.0, 1.0)
     return (times - first) / (last - first)

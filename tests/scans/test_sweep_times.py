@@ -19,17 +19,17 @@ def test_a_sweep_without_returns_at_its_seam_is_not_stretched(unit_s: float, per
 
 
 def test_shares_of_a_sweep_stay_as_they_are() -> None:
-    np.testing.assert_array_equal(sweep_times(SHARES, 7), SHARES)
+    np.testing.assert_array_equal(sweep_times(SHARES, 7, 0.0), SHARES)
 
 
 def test_times_that_fit_no_period_are_scaled_by_the_first_and_last_point() -> None:
     for times in (np.array([10.0, 20.0, 15.0]), np.array([0.0, 0.0664, 0.0332])):  # 15 Hz
-        np.testing.assert_allclose(sweep_times(times, 3), [0.0, 1.0, 0.5])
+        np.testing.assert_allclose(sweep_times(times, 3, 0.0), [0.0, 1.0, 0.5])
 
 
 def test_a_full_sweep_begins_at_0_and_ends_within_the_period() -> None:
     times = np.linspace(0.0, 0.1008, 11)  # the sensor turns a little slower than it should
-    shares = sweep_times(times, 11)
+    shares = sweep_times(times, 11, 0.0)
     assert shares[0] == 0.0
     assert shares[-1] == 1.0
 
@@ -39,4 +39,4 @@ def test_a_full_sweep_begins_at_0_and_ends_within_the_period() -> None:
     [([], 3), ([0.0, 0.1], 3), ([0.05, 0.05, 0.05], 3), ([0.0, np.nan, 0.1], 3), ([], 0)],
 )
 def test_missing_times_give_none(times: list[float], num_points: int) -> None:
-    assert len(sweep_times(np.array(times), num_points)) == 0
+    assert len(sweep_times(np.array(times), num_points, 0.0)) == 0

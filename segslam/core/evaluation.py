@@ -17,11 +17,9 @@ from segslam.core.types import IndexPairs, Indices, Mask, Points, Transform, Vec
 
 Z_UP = (0.0, 0.0, 1.0)
 """Upward axis of LiDAR frames."""
-CAMERA_UP = (0.0, -1.0, 0.0)
-"""Upward axis of KITTI's camera frames (x right, y down, z ahead)."""
 Up = Literal["z", "-y"]
-UP: dict[Up, tuple[float, float, float]] = {"z": Z_UP, "-y": CAMERA_UP}
-"""Upward axes that pose files have, by name."""
+UP: dict[Up, tuple[float, float, float]] = {"z": Z_UP, "-y": (0.0, -1.0, 0.0)}
+"""Upward axes that pose files have, by name; -y in KITTI's camera frames (x right, y down, z ahead)."""
 FLAT = 3.0  # chosen: a path is flat if it is this much wider than high; 20 real drives are 5 times at least
 ALONG = 0.8  # chosen: smallest component of a direction along its axis; 0.96 or more in these drives
 MIN_POSES = 3  # fewer poses are always aligned without error

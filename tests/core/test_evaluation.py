@@ -13,7 +13,7 @@ from kiss_icp.metrics import sequence_error
 
 from segslam.core import geometry
 from segslam.core.evaluation import (
-    CAMERA_UP,
+    UP,
     align_positions,
     loop_metrics,
     motion_errors,
@@ -69,7 +69,7 @@ def test_real_estimates_are_scored_as_evo_and_kitti_score_them(
 ) -> None:
     files = data_dir / "trajectories" / f"{name}.txt", data_dir / "kitti" / "poses" / f"{sequence}.txt"
     estimate, reference = (read_poses(file).T_a_b for file in files)
-    ours = trajectory_metrics(estimate, reference, up=CAMERA_UP)
+    ours = trajectory_metrics(estimate, reference, up=UP["-y"])
     assert ours["ate_m"] == pytest.approx(known_ate_m, abs=0.005)
 
     evo_estimate, evo_reference = (file_interface.read_kitti_poses_file(file) for file in files)

@@ -45,7 +45,7 @@ def read_message(message: Any) -> Cloud:
     Raises KeyError, TypeError or ValueError for an inconsistent message or one without x, y, z.
     """
     rows = _rows(message)
-    cloud = from_columns({name: rows[name].ravel() for name in rows.dtype.names or ()})
+    cloud = from_columns({name: rows[name].reshape(-1) for name in rows.dtype.names or ()})
     return replace(cloud, stamp_ns=stamp_ns_of(message))
 
 

@@ -42,24 +42,9 @@ class MessageClouds:
 def read_message(message: Any) -> Cloud:
     """The cloud of a message. Replaces kiss_icp's function, which misaligns points and times if a cloud contains a NaN.
 
-    Raises KeyError, TypeError or ValueError for an inconsistent message or one without x, y, z.
-    """
-    rows = _rows(message)
-    cloud = from_columns({name: rows[name].reshape(-1) for name in rows.dtype.names or ()})
-    return replace(cloud, stamp_ns=stamp_ns_of(message))
-
-
-def stamp_ns_of(message: Any) -> int:
-    """The stamp in the header of a message; 0 if it has none."""
-    stamp = message.header.stamp
-    return int(stamp.sec * 1_000_000_000 + stamp.nanosec)
-
-
-def _rows(message: Any) -> np.ndarray:
-    """(height, width) structured array with the fields of the message.
-
-    Raises ValueError unless all fields lie in a point, and all points in the data, one after the other: NumPy checks
-    neither the bounds of empty data nor those of large offsets, and lets points overlap.
+    Raises KeyError, TypeError or ValueError for an inconsistent message or one without x, y, z. All fields must lie in
+    a point, and all points in the data, one after the other: NumPy checks neither the bounds of empty data nor those
+    of large offsets, and lets points overlap.
     """
     order = ">" if message.is_bigendian else "<"
     formats = [np.dtype(order + KINDS[field.datatype]) for field in message.fields]
@@ -71,12 +56,13 @@ def _rows(message: Any) -> np.ndarray:
     for field, kind in zip(message.fields, formats, strict=True):
         if not 0 <= field.offset <= step - kind.itemsize:
             raise ValueError(f"the field {field.name[:40]} at {field.offset} is not in a point of {step} bytes")
-    dtype = np.dtype(
-        {
-            "names": [field.name for field in message.fields],
-            "formats": formats,
-            "offsets": [field.offset for field in message.fields],
-            "itemsize": step,
-        }
-    )
-    return np.ndarray((height, width), dtype, buffer=message.data, strides=(message.row_step, step))
+    names, offsets = [field.name for field in message.fields], [field.offset for field in message.fields]
+    dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+    rows = np.ndarray((height, width), dtype, buffer=message.data, strides=(message.row_step, step))
+    return replace(from_columns({name: rows[name].reshape(-1) for name in names}), stamp_ns=stamp_ns_of(message))
+
+
+def stamp_ns_of(message: Any) -> int:
+    """The stamp in the header of a message; 0 if it has none."""
+    stamp = message.header.stamp
+    return int(stamp.sec * 1_000_000_000 + stamp.nanosec)

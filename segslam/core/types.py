@@ -9,7 +9,7 @@ Shapes are checked under pytest only.
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from enum import IntEnum, StrEnum
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -290,11 +290,8 @@ class Found(Record):
     """Base of what is not `Rejected`."""
 
     __slots__ = ()
-
-    @property
-    def ok(self) -> bool:
-        """True; False for `Rejected`."""
-        return True
+    ok: ClassVar[bool] = True
+    """False for `Rejected`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -321,14 +318,11 @@ class Rejected:
     """That the best pose is right; None if none could be judged."""
     evidence: dict[str, float] = field(default_factory=dict)
     """As that of `Alignment`."""
+    ok: ClassVar[bool] = False
+    """True for a registration, alignment or closure."""
 
     def __bool__(self) -> NoReturn:
         raise TypeError("a Rejected is neither true nor false; ask isinstance(found, Rejected), or found.ok")
-
-    @property
-    def ok(self) -> bool:
-        """False; True for a registration, alignment or closure."""
-        return False
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

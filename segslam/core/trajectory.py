@@ -14,8 +14,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core import geometry
-from segslam.core.errors import brief, unreadable
+from segslam.core.errors import brief
 from segslam.core.types import IndexPairs, Indices, Mask, SegslamError, Transform, Vector
+from segslam.core.whole_files import read_text
 
 Poses = Float[np.ndarray, "_ 4 4"]
 """Rigid transforms T_a_b, one per row."""
@@ -212,10 +213,7 @@ def nearest_rows(values: np.ndarray, targets: np.ndarray) -> Indices:
 
 def _number_lines(path: Path) -> list[tuple[int, list[str]]]:
     """(line number, fields) of each line with content."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{unreadable(path, 'poses', error)}; give a KITTI or TUM trajectory") from error
+    text = read_text(path, "poses", "give a KITTI or TUM trajectory")
     split = (
         (number, re.split(r"[\s,]+", line.partition("#")[0].strip())) for number, line in enumerate(text.split("\n"), 1)
     )

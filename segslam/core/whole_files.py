@@ -1,10 +1,10 @@
-"""Paths as users give them, and atomic writing: a file appears under its name when it is complete, or not at all."""
+"""Paths as users give them, their texts, and atomic writing: a file appears when it is complete, or not at all."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from segslam.core.errors import SegslamError, WorkFailed, brief, reason
+from segslam.core.errors import SegslamError, WorkFailed, brief, reason, unreadable
 from segslam.core.interrupts import removed_when_stopped
 
 
@@ -14,6 +14,14 @@ def expanded(path: str | Path) -> Path:
         return Path(path).expanduser()
     except RuntimeError as error:
         raise SegslamError(f"{brief(str(path))}: there is no user with this name; write the folder in full") from error
+
+
+def read_text(path: Path, content: str, remedy: str) -> str:
+    """The text of a file in UTF-8. Raises SegslamError, with what it should contain and a remedy, if it has none."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SegslamError(f"{unreadable(path, content, error)}; {remedy}") from error
 
 
 def check_target(file: Path) -> None:

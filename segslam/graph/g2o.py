@@ -16,9 +16,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation as ScipyRotation
 
-from segslam.core.errors import brief, unreadable
+from segslam.core.errors import brief
 from segslam.core.trajectory import ROTATION_TOLERANCE, from_quaternions
 from segslam.core.types import Indices, SegslamError, Transform
+from segslam.core.whole_files import read_text
 from segslam.graph.edges import Edge, Transforms
 
 VERTEX, EDGE, FIX = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "FIX"
@@ -103,10 +104,7 @@ def parts(vertices: Iterable[int], edges: Iterable[Edge]) -> Indices:
 
 def _read_tables(path: Path) -> tuple[_Table, _Table, _Table]:
     """The lines with vertices, edges and fixed vertices, each line checked by itself."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{unreadable(path, 'pose graph', error)}; give a g2o file") from error
+    text = read_text(path, "pose graph", "give a g2o file")
     tables = {tag: _Table(path, [], [], []) for tag in (VERTEX, EDGE, FIX)}
     for number, line in enumerate(text.split("\n"), start=1):
         tag, *texts = line.partition("#")[0].split() or [""]

@@ -11,8 +11,9 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, AliasPath, BaseModel, Field, model_validator
 
 from segslam.core.config import LabelName, Section, parse_yaml, validated
-from segslam.core.errors import brief, unreadable
+from segslam.core.errors import brief
 from segslam.core.types import Label, SegslamError
+from segslam.core.whole_files import read_text
 
 ARCH, DATA = "arch_cfg.yaml", "data_cfg.yaml"
 Channel = Literal["range", "x", "y", "z", "intensity", "mask"]
@@ -222,10 +223,5 @@ def _imported(architecture: Path, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _read_yaml(file: Path) -> Any:
-    try:
-        return parse_yaml(file.read_text(encoding="utf-8"), str(file))
-    except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(
-            f"{unreadable(file, 'settings', error)}; a network needs this file beside its model, or the {ARCH} and "
-            f"{DATA} that were published with it"
-        ) from error
+    remedy = f"a network needs this file beside its model, or the {ARCH} and {DATA} that were published with it"
+    return parse_yaml(read_text(file, "settings", remedy), str(file))

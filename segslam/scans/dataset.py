@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.core.errors import brief, unreadable
+from segslam.core.errors import brief
 from segslam.core.geometry import raise_beams
 from segslam.core.points import squared_ranges
 from segslam.core.trajectory import nanoseconds
@@ -22,7 +22,7 @@ from segslam.core.types import (
     Transform,
     Vector,
 )
-from segslam.core.whole_files import expanded
+from segslam.core.whole_files import expanded, read_text
 from segslam.labels.encodings import ENCODINGS, Encoding
 from segslam.labels.label_files import LabelSource, of_rows
 from segslam.scans.scan_files import sweep_times
@@ -224,10 +224,7 @@ def selected_rows(scan_index: Indices, frames: str | None, source: Path) -> Indi
 
 def read_stamps(file: Path) -> Indices:
     """Times (ns) from a file with one time in seconds per line. Raises SegslamError, naming file and line."""
-    try:
-        lines = file.read_text(encoding="ascii").split()
-    except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{unreadable(file, 'scan times', error)}; expected one time in seconds per line") from error
+    lines = read_text(file, "scan times", "expected one time in seconds per line").split()
     stamps: list[int] = []
     for number, line in enumerate(lines, start=1):
         try:

@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from segslam.core import geometry
-from segslam.core.errors import brief, unreadable
+from segslam.core.errors import brief
 from segslam.core.trajectory import ROTATION_TOLERANCE, lidar_from_camera, read_poses
 from segslam.core.types import BadScan, Indices, SegslamError, Trajectory, Transform
+from segslam.core.whole_files import read_text
 from segslam.labels.label_files import open_labels
 from segslam.scans.dataset import Cloud, Dataset, DataSource, check_num_lines, read_stamps, selected_rows
 from segslam.scans.scan_files import read_bytes
@@ -105,11 +106,7 @@ def _mixes_columns(returns: Float32[np.ndarray, "_ 4"]) -> bool:
 
 def read_calibration(file: Path) -> Transform:
     """T_camera_lidar of a calib.txt. Raises SegslamError if the file or the entry is missing or invalid."""
-    try:
-        text = file.read_text(encoding="ascii")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{unreadable(file, 'calibration', error)}; put KITTI's calib.txt there") from error
-    return parse_calibration(text, file)
+    return parse_calibration(read_text(file, "calibration", "put KITTI's calib.txt there"), file)
 
 
 def parse_calibration(text: str, file: Path) -> Transform:

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.errors import unreadable
 from segslam.core.trajectory import rows_of_same_scan
 from segslam.core.types import IndexPairs, Label, Labels, Points, SegslamError, Trajectory, Transform
+from segslam.core.whole_files import read_text
 
 MIN_GAP = 50
 """Smallest number of scans between the two of a pair, as in the paper's lists."""
@@ -42,12 +42,7 @@ def read_pairs(file: Path) -> PairList:
 
     Raises SegslamError, naming file and line, for another form.
     """
-    try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(
-            f"{unreadable(file, 'pairs', error)}; give a file with `source target` on each line"
-        ) from error
+    text = read_text(file, "pairs", "give a file with `source target` on each line")
     pairs = _from_json(file, text) if file.suffix == ".json" else _from_text(file, text)
     if len(pairs.pairs) == 0:
         raise SegslamError(f"{file}: contains no pairs; write `source target` on each line")

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation as ScipyRotation
 from segslam.core import geometry
 from segslam.core.trajectory import Poses, lidar_from_camera, read_poses
 from segslam.core.types import SegslamError, Vector
+from segslam.core.whole_files import read_text
 from segslam.scans.dataset import read_stamps
-from segslam.scans.kitti import parse_calibration, read_calibration
+from segslam.scans.kitti import parse_calibration
 
 # The camera looks along the x axis of the LiDAR: nominal mounting of KITTI's car.
 NOMINAL_CALIB = (
@@ -89,10 +90,8 @@ def read_drive(poses_file: Path, *, sequence: str) -> Drive:
     """
     T_world_camera = read_poses(poses_file, format="kitti").T_a_b
     calib_file, times_file = (_beside(poses_file, name, sequence) for name in ("calib.txt", "times.txt"))
-    calib = NOMINAL_CALIB
-    T_camera_lidar = parse_calibration(calib, Path("calib.txt")) if calib_file is None else read_calibration(calib_file)
-    if calib_file is not None:
-        calib = calib_file.read_text(encoding="ascii")
+    calib = NOMINAL_CALIB if calib_file is None else read_text(calib_file, "calibration", "put KITTI's calib.txt there")
+    T_camera_lidar = parse_calibration(calib, calib_file or Path("calib.txt"))
     count = len(T_world_camera)
     time_s = np.arange(count) * PERIOD_S
     if times_file is not None:

@@ -24,7 +24,8 @@ from segslam.core.config.sections import Section as Section
 from segslam.core.config.sections import SegregatorConfig as SegregatorConfig
 from segslam.core.config.sections import SensorCalibrationConfig as SensorCalibrationConfig
 from segslam.core.config.sections import VerifyConfig as VerifyConfig
-from segslam.core.errors import SegslamError, brief, unreadable
+from segslam.core.errors import SegslamError, brief
+from segslam.core.whole_files import read_text
 
 logger = logging.getLogger(__name__)
 Model = TypeVar("Model", bound=BaseModel)
@@ -115,7 +116,8 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = (), *, base
     Raises SegslamError, naming the file and key, for unreadable YAML, unknown keys and values out of range.
     """
     values = base.model_dump(mode="json") if base else {}
-    for name, section in (_read_yaml(path) if path else {}).items():
+    given = _parse_yaml(read_text(path, "configuration", "give a YAML file"), str(path)) if path else {}
+    for name, section in given.items():
         known = values.get(name)
         values[name] = known | section if isinstance(known, dict) and isinstance(section, dict) else section
     source = " and ".join([*([str(path)] if path else []), *(["--set"] if overrides or not path else [])])
@@ -208,14 +210,6 @@ def _without_removed(values: dict[str, Any], source: str) -> dict[str, Any]:
         verbs = "no longer exists and is" if len(all_gone) == 1 else "no longer exist and are"
         logger.warning("%s: %s %s ignored", source, ", ".join(all_gone), verbs)
     return kept
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{unreadable(path, 'configuration', error)}; give a YAML file") from error
-    return _parse_yaml(text, str(path))
 
 
 def _parse_yaml(text: str, source: str) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import Any
 from segslam.core.config import parse_yaml, short
 from segslam.core.errors import unreadable
 from segslam.core.types import SegslamError
+from segslam.core.whole_files import read_text
 from segslam.labels.label_files import NETWORK, whole_source
 
 
@@ -80,10 +81,7 @@ def read_drives(file: Path) -> list[Drive]:
 
     Relative paths are relative to the list. Raises SegslamError, naming the file and the entry.
     """
-    try:
-        values = parse_yaml(file.read_text(encoding="utf-8"), str(file))
-    except (OSError, UnicodeDecodeError) as error:
-        raise SegslamError(f"{unreadable(file, 'list of drives', error)}; give a list of drives in YAML") from error
+    values = parse_yaml(read_text(file, "list of drives", "give a list of drives in YAML"), str(file))
     if isinstance(values, dict) and set(values) == {"drives"}:
         values = values["drives"]
     if not isinstance(values, list) or not values:

@@ -177,13 +177,13 @@ def _score_files(
     rows = matching_rows(estimate, reference, max_difference_ns=round(how.max_difference * 1e9))
     matched, truth = estimate.T_a_b[rows[:, 0]], reference.T_a_b[rows[:, 1]]
     up, why = how.up, ""
-    if up is None and len(rows):
+    if up is None:
         up, why = upward_axis(truth), "the path is flattest along it"
         if up is None and estimate.stamp_ns is None:
             up, why = "-y", "as in KITTI's files; the path does not show it"
         elif up is None:
             up, why = "z", "the path does not show it"
-    figures = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance, up=UP[up or "z"])
+    figures = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance, up=UP[up])
     if not figures:
         raise SegslamError(
             f"{estimate_file}: only {len(rows)} of its {len(estimate)} poses match one of the {len(reference)} "
@@ -194,7 +194,7 @@ def _score_files(
     if plot is not None:
         from segslam.output.report.comparison import draw_scored
 
-        draw_scored(plot, matched, truth, up=up or "z")
+        draw_scored(plot, matched, truth, up=up)
     if not len(rows) == len(estimate) == len(reference):
         terminal.say(f"scored {len(rows)} poses; estimate {len(estimate)}, reference {len(reference)}")
     return figures | {"num_poses": len(rows), "up": up}

@@ -120,6 +120,8 @@ def upward_axis(poses: Poses) -> Up | None:
     It is the normal of the plane in which the positions lie. Of a straight drive, the direction of travel shows it:
     cameras look along z, so their y points down. Both hold for vehicles, and for persons who walk on a floor.
     """
+    if len(poses) < MIN_POSES:
+        return None
     positions = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
     _, (_, width, height), axes = np.linalg.svd(positions, full_matrices=False)
     if width > FLAT * height:

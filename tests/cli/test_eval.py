@@ -67,6 +67,12 @@ def test_rows_of_another_number_cannot_be_matched_but_stamps_can(
     assert "absolute trajectory error after alignment" in printed.out
 
 
+def test_two_poses_are_too_few_to_be_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_kitti(tmp_path / "two.txt", np.tile(np.eye(4), (2, 1, 1)))
+    assert _eval("--estimate", tmp_path / "two.txt", "--reference", tmp_path / "two.txt") == 2
+    assert "only 2 of its 2 poses match one of the 2" in capsys.readouterr().err
+
+
 def test_the_upward_axis_of_kitti_files_is_found_and_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     made = make_run(tmp_path / "run")
     off = made.truth.T_world_lidar.copy()

@@ -304,3 +304,4 @@ def test_a_path_that_does_not_show_its_upward_axis_has_none() -> None:
     assert upward_axis(straight[:, [2, 0, 1, 3]][:, :, [2, 0, 1, 3]]) == "z"
     turned = geometry.transform(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.zeros(3)) @ straight
     assert upward_axis(turned) is None  # the frame is not that of the first pose
+    assert [upward_axis(straight[:few]) for few in range(3)] == [None] * 3

@@ -100,7 +100,7 @@ class CheckedOdometry:
             return T_odom_proposed, Motion(MotionState.UNCHECKED)
         self._num_unchecked = 0
         if len(scan.thinned) < MIN_POINTS:
-            return T_odom_proposed, Motion(MotionState.UNCHECKED)  # too sparse for a check
+            return self._unseen(T_odom_proposed, gap)
         if len(self._map) == 0:
             self._map.add(T_odom_proposed, scan)
             return T_odom_proposed, Motion(MotionState.UNCHECKED)
@@ -180,10 +180,29 @@ class CheckedOdometry:
             self._map = LocalMap(self._refine)
             self._motion.begin_map()
         self._map.add(T_odom_lidar, scan)
+        self._follow(state, T_odom_lidar)
+        return T_odom_lidar, self._result(state, T_map_proposed, best, covariance)
+
+    def _unseen(self, T_odom_proposed: Transform, gap: float) -> tuple[Transform, Motion]:
+        """The pose of a scan with too few points to show its motion: that of other sensors, or the predicted one.
+
+        KISS-ICP aligns even a few points, at any pose.
+        """
+        if not self._inner.is_from_scans or not self._motion.predicts:
+            return T_odom_proposed, Motion(MotionState.UNCHECKED)
+        T_last_lidar, covariance = self._motion.update(self._motion.predicted(gap), np.diag(ANYWHERE**2), gap)
+        T_odom_lidar = geometry.nearest_transform(self._T_odom_last @ T_last_lidar)
+        state = self._state(_off(T_odom_lidar, covariance, T_odom_proposed), covariance, is_unlikely=True)
+        if state is MotionState.CONFIRMED:
+            T_odom_lidar = T_odom_proposed
+        self._follow(state, T_odom_lidar)
+        return T_odom_lidar, Motion(state, information=self._own_information(covariance), covariance=covariance)
+
+    def _follow(self, state: MotionState, T_odom_lidar: Transform) -> None:
+        """Let the odometry continue from the pose and the local map here, if its own pose was replaced."""
         if state in (MotionState.REPAIRED, MotionState.BROKEN):
             self._inner.follow(self._map.scans, T_odom_lidar, self._motion.T_step)
             self._T_odom_inner = np.eye(4)
-        return T_odom_lidar, self._result(state, T_map_proposed, best, covariance)
 
     def _poses(
         self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan, gap: float

@@ -91,6 +91,11 @@ class MotionModel:
         """True once a motion was measured; the first has no prediction, and an odometry is easily wrong there."""
         return self._covariance is not None
 
+    @property
+    def predicts(self) -> bool:
+        """True once it is known how much motions change."""
+        return len(self._changes) >= LEAST_KNOWN
+
     def predicted(self, gap: float) -> Transform:
         """The motion over `gap` intervals, if it does not change."""
         return geometry.scaled(self.T_step, gap)
@@ -102,7 +107,7 @@ class MotionModel:
 
     def _predicted_covariance(self, gap: float) -> Information | None:
         """(6, 6) of the predicted motion; None while too few motions are known."""
-        if len(self._changes) < LEAST_KNOWN:
+        if not self.predicts:
             return None
         noise = np.diag(np.median(np.square(self._changes), axis=0) / CHI_SQUARE_MEDIAN)
         before = np.zeros((6, 6)) if self._covariance is None else self._covariance

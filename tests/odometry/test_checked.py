@@ -270,6 +270,20 @@ def test_a_sparse_first_scan_does_not_end_the_checks_of_a_drive() -> None:
     assert _worst_step_m(results[1:]) < 0.2
 
 
+def test_scans_of_a_few_points_move_on_as_before_though_the_odometry_aligns_them_elsewhere() -> None:
+    scans, truth = round_drive()
+    few = [replace(scan, points=scan.points[::700], labels=scan.labels[::700]) for scan in scans[SLIP_AT : SLIP_AT + 4]]
+    trajectory = replace(truth, T_world_lidar=_slipped(metres=2.0, degrees=60.0))
+    odometry = CheckedOdometry(_LikeKiss(trajectory, CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
+    results = _registered(odometry, [*scans[:SLIP_AT], *few, *scans[SLIP_AT + 4 : SLIP_AT + 8]])
+    assert _worst_step_m(results) < 0.25
+    motions = [result.motion for result in results[SLIP_AT - 1 : SLIP_AT + 4] if result.motion]
+    assert motions[1].state is MotionState.REPAIRED
+    unsure_m = [np.sqrt(motion.covariance[3:, 3:].trace()) for motion in motions if motion.covariance is not None]
+    assert len(unsure_m) == 5
+    assert (np.diff(unsure_m) > 0.0).all(), "each motion adds to what is not known of the last"
+
+
 @pytest.mark.parametrize("degrees", [-25.0, pytest.param(32.0, marks=pytest.mark.slow)])
 def test_a_sudden_turn_is_found_by_the_search_around_the_last_pose(degrees: float) -> None:
     """Both the odometry and its prediction miss the turn, and no registration without initial guess is accepted."""

@@ -164,7 +164,7 @@ class CheckedOdometry:
         is_unsure = bool(unsure[3:, 3:].max() > BREAK_M**2)
         if not self._inner.is_from_scans and (is_unsure or not self._contradicts(fits, T_map_proposed, scan)):
             return self._kept(T_odom_proposed, T_map_proposed, best, scan, gap, is_unsure=is_unsure)
-        is_lost = elsewhere * ELSEWHERE_M**2 > BREAK_M**2 and not is_rejoined
+        is_lost = elsewhere > 0.5 and not is_rejoined
         T_last_lidar = geometry.nearest_transform(geometry.inverse(self._T_odom_last) @ T_odom_map @ best.T_map_lidar)
         covariance = own = self._covariance(best)
         if by_chance < 0.5:  # a pose by chance does not show the speed

@@ -270,6 +270,22 @@ def test_a_sparse_first_scan_does_not_end_the_checks_of_a_drive() -> None:
     assert _worst_step_m(results[1:]) < 0.2
 
 
+@pytest.mark.parametrize(("probability", "is_kept"), [(0.1, True), (0.6, False)])
+def test_the_local_map_is_given_up_where_a_scan_is_more_probably_elsewhere(
+    probability: float, is_kept: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scans, truth = round_drive()
+    none = Rejected(RejectReason.HIGH_RESIDUAL)
+    odometry = CheckedOdometry(_LikeKiss(truth, CONFIG.odometry), CONFIG, recover=lambda source, target: none)
+    _registered(odometry, scans[:SLIP_AT])
+    monkeypatch.setattr(odometry, "_is_usual", lambda fits: False)
+    monkeypatch.setattr(odometry._search, "elsewhere", lambda scan, fits: probability)
+    motion = odometry.register(scans[SLIP_AT]).motion
+    assert motion is not None
+    assert motion.state is MotionState.BROKEN
+    assert (len(odometry._map) > 1) is is_kept
+
+
 def test_scans_of_a_few_points_move_on_as_before_though_the_odometry_aligns_them_elsewhere() -> None:
     scans, truth = round_drive()
     few = [replace(scan, points=scan.points[::700], labels=scan.labels[::700]) for scan in scans[SLIP_AT : SLIP_AT + 4]]

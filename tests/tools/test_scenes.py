@@ -13,6 +13,7 @@ from segslam.labels import geometric_labels
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import pair, register_prepared
 from tools.benchmarks import scenes
+from tools.benchmarks.scene_drives import driven
 from tools.benchmarks.scene_models import SCENES, SENSORS, corridor, scan_points
 
 CONFIG = Config()
@@ -142,3 +143,14 @@ def _check(scene: str, sensor: str, noise_m: float, *, count: int, kept: float) 
     assert row["false_accepted"] == 0, row
     assert row["accepted_wrong"] == 0, row
     assert row["kept"] >= kept * row["overlapping"], row
+
+
+def test_a_drive_leads_through_a_scene_and_back() -> None:
+    drive = driven("forest", "16", 3, 1)
+    moved = geometry.inverse(drive.T_world_lidar[0]) @ drive.T_world_lidar[-1]
+    assert geometry.distance(moved) < 0.5
+    assert np.degrees(geometry.angle(moved)) > 170.0
+    steps_m = np.linalg.norm(np.diff(drive.T_world_lidar[:, :3, 3], axis=0), axis=1)
+    assert steps_m.max() < 0.5
+    assert steps_m.sum() > 130.0
+    assert len(drive.points_of(0)) > 5000

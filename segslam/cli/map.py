@@ -171,8 +171,7 @@ def map_data(
     from segslam.run.map_folder import given_odometry, in_effect, open_scans, resume_options
 
     map_names, map_files = output.maps(folder)
-    outside = [file for file in map_files if folder not in file.parents and file.parent.is_dir()]  # others are made
-    check_free(outside, overwrite=output.overwrite or options.resume)
+    check_free([file for file in map_files if folder not in file.parents], overwrite=output.overwrite or options.resume)
     source = options.source(data, options.labels, options.encoding)
     scans = open_scans(source, settings)
     if settings.map.color == "intensity":

@@ -127,9 +127,3 @@ def test_a_map_that_cannot_be_made_does_not_affect_other_results(
     assert (out / "report.html").is_file()
     assert run("map", kitti, "--out", out, "--map", "--resume", "--quiet") == 0
     assert (out / "map.ply").is_file()
-
-
-def test_a_map_file_in_a_folder_that_is_missing_is_accepted(tmp_path: Path) -> None:
-    write_kitti_sequence(tmp_path / "kitti", num_scans=2)
-    file = tmp_path / "new" / "map.ply"
-    assert run("map", tmp_path / "kitti", "--out", tmp_path / "r", "--map-file", file, "--dry-run") == 0

@@ -40,8 +40,8 @@ class Confirmation:
         If they confirm each other, the noise of an odometry that contradicts them is increased.
         """
         waiting = self._waiting if self.is_waiting(closure.source_id) else []
-        pairs = self._graph.consistent_pairs([closure, *(other for _, other in waiting)])
-        consistent = list(compress(waiting, pairs[0, 1:]))
+        closures = [closure, *(other for _, other in waiting)]
+        consistent = list(compress(waiting, self._graph.consistent_pairs(closures)[0, 1:])) if waiting else []
         sources = {other.source_id for _, other in consistent} - {closure.source_id}
         travel_m = self._graph.travel_m
         if (

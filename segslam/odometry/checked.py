@@ -7,7 +7,8 @@ are explained, no motion, poses all around, and place recognition. The most like
 the scan nearly as well, that is the one with the usual motion. At the start, after a repair, and while its poses differ
 from the last registrations by more than these are unsure, every scan is registered. After a repair the odometry
 continues from the local map; smaller corrections leave it undisturbed. They are added to its following poses while
-every scan is registered; else they are taken as errors that it corrects itself.
+every scan is registered; else they are taken as errors that it corrects itself. A scan with too few points to show its
+motion moves on as the last ones did.
 """
 
 import math
@@ -100,7 +101,7 @@ class CheckedOdometry:
             return T_odom_proposed, Motion(MotionState.UNCHECKED)
         self._num_unchecked = 0
         if len(scan.thinned) < MIN_POINTS:
-            return self._unseen(T_odom_proposed, gap)
+            return self._of_few_points(T_odom_proposed, gap)
         if len(self._map) == 0:
             self._map.add(T_odom_proposed, scan)
             return T_odom_proposed, Motion(MotionState.UNCHECKED)
@@ -183,7 +184,7 @@ class CheckedOdometry:
         self._follow(state, T_odom_lidar)
         return T_odom_lidar, self._result(state, T_map_proposed, best, covariance)
 
-    def _unseen(self, T_odom_proposed: Transform, gap: float) -> tuple[Transform, Motion]:
+    def _of_few_points(self, T_odom_proposed: Transform, gap: float) -> tuple[Transform, Motion]:
         """The pose of a scan with too few points to show its motion: that of other sensors, or the predicted one.
 
         KISS-ICP aligns even a few points, at any pose.

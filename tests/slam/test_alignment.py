@@ -11,7 +11,7 @@ from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.registration.refinement import LightSurface
 from segslam.slam.adjustment.alignment import _normal_equations, align
-from segslam.slam.adjustment.submaps import members, submaps_of
+from segslam.slam.adjustment.submaps import members, surfaces_of
 
 WAY_M = 12.0
 
@@ -19,7 +19,7 @@ WAY_M = 12.0
 def submap(x_m: float, *, low_deg: float = 0.0, pitch_deg: float = 0.0, seed: int = 0) -> LightSurface:
     """One scan."""
     points = seen(x_m, low_deg=low_deg, pitch_deg=pitch_deg, seed=seed).astype(np.float32)
-    return submaps_of(lambda _: points, np.eye(4)[None], np.zeros(1), config=RefineConfig())(0)
+    return surfaces_of(lambda _: points, np.eye(4)[None], np.zeros(1), config=RefineConfig())(0)
 
 
 def guess() -> np.ndarray:
@@ -80,7 +80,7 @@ def test_submaps_are_freed_at_once_with_the_function_that_returns_them() -> None
     points = seen(0.0).astype(np.float32)
     gc.disable()
     try:
-        submap_of = submaps_of(lambda _: points, np.eye(4)[None], np.zeros(1), config=RefineConfig())
+        submap_of = surfaces_of(lambda _: points, np.eye(4)[None], np.zeros(1), config=RefineConfig())
         kept = weakref.ref(submap_of(0))
         assert kept() is submap_of(0)
         del submap_of

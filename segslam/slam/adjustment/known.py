@@ -16,7 +16,7 @@ from segslam.core.config import RefineConfig
 from segslam.core.trajectory import Poses
 from segslam.core.types import Transform, Vector
 from segslam.slam.adjustment.alignment import Alignment, PointsOf
-from segslam.slam.adjustment.submaps import Aligned, aligned_by, submaps_of
+from segslam.slam.adjustment.submaps import Aligned, aligned_by, surfaces_of
 from segslam.slam.adjustment.sweeps import Correction, Sweep, corrected_by
 from segslam.slam.adjustment.vertical_angle import VerticalAngle
 
@@ -52,7 +52,7 @@ class Known:
     def aligned(self, points_of: PointsOf, motion_variance: Vector, *, config: RefineConfig) -> Aligned:
         """Aligns submaps that are built by the poses of their own drives, from rounded initial guesses."""
         corrected = corrected_by(self.corrections, points_of)
-        align = aligned_by(submaps_of(corrected, self.T_own_keyframe, motion_variance, config=config))
+        align = aligned_by(surfaces_of(corrected, self.T_own_keyframe, motion_variance, config=config))
 
         def aligned(target_id: int, source_id: int, T_target_source: Transform) -> Alignment | None:
             guess = rounded(T_target_source)

@@ -23,7 +23,7 @@ from segslam.graph import Edge, PoseGraph
 from segslam.registration.refinement import INFORMATION_SCALE, limited_information
 from segslam.slam.adjustment.alignment import PointsOf
 from segslam.slam.adjustment.known import Known
-from segslam.slam.adjustment.submaps import EVERY, REACH, STEPS, Aligned, aligned_by, all_pairs, submaps_of
+from segslam.slam.adjustment.submaps import EVERY, REACH, STEPS, Aligned, aligned_by, all_pairs, surfaces_of
 from segslam.slam.adjustment.sweeps import Sweep, Velocities, corrected_by, corrections_of, measure_sweep
 from segslam.slam.adjustment.thickness import is_thicker, map_thickness_m, median_m
 from segslam.slam.adjustment.vertical_angle import VerticalAngle, measure_vertical_angle
@@ -214,8 +214,8 @@ def _rounds(
         raised_deg = 0.0 if angle is None else angle.correction_deg
         corrections = known.corrections if known else corrections_of(raised_deg, sweep, velocities)
         shared_within = STEPS[-1] if any(one.raised_deg for one in corrections) else 0
-        submap_of = submaps_of(corrected_by(corrections, points_of), T_world, motion_variance, config=refine)
-        aligned = of_drives or aligned_by(submap_of)
+        surface_of = surfaces_of(corrected_by(corrections, points_of), T_world, motion_variance, config=refine)
+        aligned = of_drives or aligned_by(surface_of)
         pairs = all_pairs(T_world, travel_m, graph.covariances, min_travel_m=config.proximity.min_travel_m)
         in_time = takewhile(lambda _: monotonic() < end_s, register_pairs(pairs, aligned, T_world, config=refine))
         tried = list(progress(in_time, len(pairs), f"refine {number}/{config.adjustment.rounds}"))

@@ -37,10 +37,10 @@ Aligned = Callable[[int, int, Transform], Alignment | None]
 """The alignment of a target and a source, by their ids, near an initial guess."""
 
 
-def submaps_of(
+def surfaces_of(
     points_of: PointsOf, T_world: Poses, motion_variance: Vector, *, config: RefineConfig
 ) -> Callable[[int], LightSurface]:
-    """Returns the submap of a keyframe by its id, in its frame; made when it is needed, and kept for a while.
+    """Returns the surface of a submap by the id of its keyframe, in its frame; made when needed, and kept for a while.
 
     `motion_variance`: as of `is_known`. No object here refers to itself, so that the submaps are freed at once when the
     function is no longer needed.
@@ -60,9 +60,9 @@ def submaps_of(
     return submap
 
 
-def aligned_by(submap_of: Callable[[int], LightSurface]) -> Aligned:
+def aligned_by(surface_of: Callable[[int], LightSurface]) -> Aligned:
     """Returns the alignment of two submaps near an initial guess."""
-    return lambda target_id, source_id, T_guess: align(submap_of(source_id), submap_of(target_id), T_guess)
+    return lambda target_id, source_id, T_guess: align(surface_of(source_id), surface_of(target_id), T_guess)
 
 
 def members(keyframe_id: int, motion_variance: Vector, *, most_m: float) -> list[int]:

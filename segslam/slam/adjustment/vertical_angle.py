@@ -25,7 +25,7 @@ from segslam.odometry.kiss import KissOdometry
 from segslam.odometry.sweep import Odometry
 from segslam.registration.refinement import downsample
 from segslam.slam.adjustment.alignment import MIN_PAIRS, MOST_PAIRS, PointsOf, Shown, shown
-from segslam.slam.adjustment.submaps import submaps_of
+from segslam.slam.adjustment.submaps import surfaces_of
 
 APART_M = (20.0, 30.0)
 """Travel between the two submaps of a pair, in turn. Chosen on KITTI 00, thin and dense scans; between single scans the
@@ -105,8 +105,8 @@ def measure_vertical_angle(
         def raised(keyframe_id: int) -> Points:
             return geometry.raise_beams(thinned(keyframe_id), correction_deg)
 
-        submap_of = submaps_of(raised, T_world, variance, config=config)
-        return shown(pairs, submap_of, T_world, lambda _, points: np.radians(geometry.raising(points))[None])
+        surface_of = surfaces_of(raised, T_world, variance, config=config)
+        return shown(pairs, surface_of, T_world, lambda _, points: np.radians(geometry.raising(points))[None])
 
     found = left_of(0.0)
     if found is None:

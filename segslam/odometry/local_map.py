@@ -12,6 +12,8 @@ from segslam.core.types import Points, Registration, Transform
 from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.nudge import CHECK_VOXELS, NUM_POINTS, NUM_SEARCH, POLISH_VOXELS, SEARCH_VOXELS, nudge
 from segslam.registration import refinement
+from segslam.registration.free_space import FreeSpace, observe_free_space
+from segslam.registration.prepared import Observed
 
 MAP_SCANS = 40
 """Chosen: number of scans in the map. With 10 the poses drift farther (NCLT 0.7 m, with 40 0.5 m, with 80 0.5 m)."""
@@ -50,6 +52,16 @@ class SeenScan:
     def surface(self) -> refinement.Surface:
         """The surface for a registration."""
         return refinement.make_surface(self.thinned, config=self._config)
+
+    @cached_property
+    def free_space(self) -> FreeSpace:
+        """Where the sensor saw through."""
+        return observe_free_space(self.points)
+
+    @cached_property
+    def observed(self) -> Observed:
+        """For the score of loops."""
+        return Observed(self.surface, self.free_space)
 
 
 class LocalMap:
@@ -110,6 +122,11 @@ class LocalMap:
             merged = clouds[0] if len(clouds) == 1 else refinement.merge_clouds(clouds, config=self._config)
             self._surface = refinement.make_surface(merged, config=self._config)
         return self._surface
+
+    @property
+    def observed(self) -> Observed:
+        """The surface, with what the newest scan saw through."""
+        return Observed(self.surface(), self.newest.free_space)
 
     def check(self, scan: SeenScan, T_map_lidar: Transform) -> Fit | None:
         """The pose after a few steps from this one to the newest scan alone; None if the two scans do not overlap."""

@@ -157,8 +157,9 @@ class MotionModel:
         posterior = _posterior(gain, prior, measured)
         carried = np.zeros((6, 6)) if prior is None else self._accumulated @ left.T
         self._covariance, self._accumulated = posterior / gap**2, carried + posterior
-        total = posterior + carried + carried.T
-        total = (total + total.T) / 2
+        added, directions = eigh(carried + carried.T, posterior)
+        half = posterior @ directions
+        total = posterior + (half * np.maximum(added, 0.0)) @ half.T  # errors that cancel may not be counted on
         self._unseen.append(left @ total @ left.T)
         self.follow(T_fused, gap)
         return T_fused, total + np.outer(regained, regained)

@@ -1,4 +1,8 @@
-"""Poses of a scan in a local map: proposed in several ways, registered, and ordered by likelihood."""
+"""Poses of a scan in a local map: proposed in several ways, registered, and ordered by their probability.
+
+The likelihood of the points prefers poses at which a scan of new surroundings overlaps the map most: it slides back
+along a wall. So different poses are compared by the score of loops, to which points out of the map's sight say nothing.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -12,9 +16,7 @@ from segslam.keyframes import DENSE_VOXELS
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import SEARCH_VOXELS_GICP, LocalMap, SeenScan
 from segslam.odometry.nudge import SEARCH_VOXELS
-from segslam.registration.free_space import observe_free_space
-from segslam.registration.prepared import Observed
-from segslam.verification import chance_of_wrong
+from segslam.verification import log_odds
 
 Recover = Callable[[Points, Points], Alignment | Rejected]
 """Registers a source (n, 3) with a target (m, 3) without initial guess, and verifies the result."""
@@ -58,13 +60,13 @@ class PoseSearch:
         *,
         prior: Prior = unknown,
     ) -> list[Fit]:
-        """`known` poses and those to which registrations from the proposals lead, the most likely first."""
+        """`known` poses and those to which registrations from the proposals lead, the most probable first."""
         starts: list[Transform] = []
         for T_map_start in T_map_proposed:
             if not any(self.is_same(scan, T_map_start, T_map_other) for T_map_other in starts):
                 starts.append(T_map_start)
         found = [fit for T_map_start in starts for fit in local.register(scan, T_map_start)]
-        return self._different(scan, [*known, *(_with(prior, fit) for fit in found)])
+        return self._compared(local, scan, [*known, *(_with(prior, fit) for fit in found)])
 
     def around(
         self,
@@ -83,38 +85,39 @@ class PoseSearch:
             for turn in TURNS
         ]
         reached = [local.approach(scan, T_map_start) for T_map_start in starts]
-        found = self._different(scan, [*known, *(_with(prior, fit) for fit in reached if fit is not None)])
-        others = [fit.T_map_lidar for fit in found if not any(fit is other for other in known)]
+        found = self._compared(local, scan, [*known, *(_with(prior, fit) for fit in reached if fit is not None)])
+        T_map_known = [fit.T_map_lidar for fit in known]
+        others = [fit.T_map_lidar for fit in found if not any(fit.T_map_lidar is other for other in T_map_known)]
         registered = [fit for T_map_start in others[:NUM_REGISTERED] for fit in local.register(scan, T_map_start)]
-        return self._different(scan, [*found, *(_with(prior, fit) for fit in registered)])
+        return self._compared(local, scan, [*found, *(_with(prior, fit) for fit in registered)])
 
     def without_guess(self, local: LocalMap, scan: SeenScan) -> list[Fit]:
         """Poses reached from the one that place recognition finds and verifies; none if it finds none."""
         alignment = self._recover(scan.points, local.cloud(DENSE_VOXELS))
         if isinstance(alignment, Rejected):
             return []
-        return self._different(scan, local.register(scan, alignment.fine.T_target_source))
+        return local.register(scan, alignment.fine.T_target_source)
 
     def elsewhere(self, scan: SeenScan, fits: Sequence[Fit]) -> float:
-        """Probability that the most likely of different poses is as wrong as those far from it; 1 without any pose."""
+        """Probability that a pose far from the most probable one is right instead; 1 without any pose."""
         if not fits:
             return 1.0
         far = [fit for fit in fits[1:] if self._apart_m(scan, fits[0], fit) > self.far_m]
-        return as_likely(far[0], fits[0]) if far else 0.0
+        return as_probable(far[0], fits[0]) if far else 0.0
 
-    def chance_of_wrong(self, local: LocalMap, scan: SeenScan, best: Fit) -> float:
-        """Probability that a pose is wrong, by the score of loops, if it may be far from all that were tried."""
-        own = Observed(scan.surface, observe_free_space(scan.points))
-        earlier = Observed(local.surface(), observe_free_space(local.newest.points))
-        return chance_of_wrong(own, earlier, best.T_map_lidar)
+    def log_odds(self, local: LocalMap, scan: SeenScan, fit: Fit) -> float:
+        """Log odds that a pose is right, by the score of loops (nats)."""
+        if fit.log_odds is not None:
+            return fit.log_odds
+        return log_odds(scan.observed, local.observed, fit.T_map_lidar)
 
     def spread(self, scan: SeenScan, fits: Sequence[Fit]) -> Information:
-        """Covariance (6, 6) of the choice between poses near the most likely one, tangent in the scan's frame."""
+        """Covariance (6, 6) of the choice between poses near the most probable one, tangent in the scan's frame."""
         covariance, total = np.zeros((6, 6)), 1.0
         for fit in fits[1:]:
             if self._apart_m(scan, fits[0], fit) <= self.far_m:
                 offset = geometry.log(geometry.inverse(fits[0].T_map_lidar) @ fit.T_map_lidar)
-                weight = as_likely(fit, fits[0])
+                weight = as_probable(fit, fits[0])
                 covariance += weight * np.outer(offset, offset)
                 total += weight
         return covariance / total
@@ -122,23 +125,26 @@ class PoseSearch:
     def _apart_m(self, scan: SeenScan, one: Fit, other: Fit) -> float:
         return geometry.displacement_m(scan.few, one.T_map_lidar, other.T_map_lidar)
 
-    def _different(self, scan: SeenScan, fits: Sequence[Fit]) -> list[Fit]:
-        """The fits, the most likely first, without those that are near a more likely one."""
+    def _compared(self, local: LocalMap, scan: SeenScan, fits: Sequence[Fit]) -> list[Fit]:
+        """The most probable pose first; of poses near each other only the one that explains the scan best."""
         kept: list[Fit] = []
-        for fit in sorted(fits, key=lambda each: -each.mean_odds):
+        for fit in sorted(fits, key=lambda each: -each.log_likelihood - each.log_prior):
             if not any(self.is_same(scan, fit.T_map_lidar, other.T_map_lidar) for other in kept):
                 kept.append(fit)
-        return kept
+        if len(kept) < 2:
+            return kept
+        judged = [replace(fit, log_odds=self.log_odds(local, scan, fit)) for fit in kept]
+        return sorted(judged, key=lambda fit: -_log_posterior(fit))
 
 
-def as_likely(fit: Fit, best: Fit) -> float:
-    """Probability of at least the difference between the likelihoods of two poses, if both are wrong; and their priors.
+def as_probable(fit: Fit, best: Fit) -> float:
+    """Ratio of the probability of a pose to that of the best one, of those compared; at most 1."""
+    return math.exp(min(0.0, _log_posterior(fit) - _log_posterior(best)))
 
-    The mean log-likelihood of n patches fluctuates by 1 / sqrt(n); spacings of order statistics are exponentially
-    distributed (Renyi 1953). Measured on scans of NCLT in maps of other places: 95 % of the differences are below 0.14
-    where this expects 0.135.
-    """
-    return math.exp(min(0.0, (fit.mean_odds - best.mean_odds) * math.sqrt(best.num_patches)))
+
+def _log_posterior(fit: Fit) -> float:
+    assert fit.log_odds is not None
+    return fit.log_odds + fit.log_likelihood + fit.log_prior
 
 
 def _with(prior: Prior, fit: Fit) -> Fit:

@@ -144,7 +144,6 @@ def register_near(
     return judged(trial.found(coarse, fine), None, config=config)
 
 
-def chance_of_wrong(source: Observed, target: Observed, T_target_source: Transform) -> float:
-    """The probability that a pose of the source in the target is wrong, if it was found among many."""
-    counts = patches.agreement(source, target, T_target_source).counts
-    return 1.0 / (1.0 + math.exp(score.shipped().log_odds(counts)))
+def log_odds(source: Observed, target: Observed, T_target_source: Transform) -> float:
+    """Log odds that a pose of the source in the target is right, by what their patches show there (nats)."""
+    return score.shipped().log_odds(patches.agreement(source, target, T_target_source).counts)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,11 +21,12 @@ from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, information_of
 from segslam.odometry.nudge import CHECK_VOXELS, nudge
-from segslam.odometry.search import PoseSearch, as_likely
+from segslam.odometry.search import PoseSearch, as_probable
 from segslam.odometry.sweep import GivenOdometry, OdometryResult
 from segslam.odometry.tracker import Tracker
 from segslam.registration.refinement import SHARED_NOISE_DEG, SHARED_NOISE_M
 from segslam.registration.refinement import refine as refined
+from segslam.scans import open_dataset
 from segslam.slam.slam import Slam
 from segslam.verification import register
 
@@ -331,11 +333,67 @@ def test_of_two_poses_that_explain_a_scan_nearly_as_well_the_usual_motion_is_mor
     assert model.log_prior(step, exact, 1.0) == 0.0
     assert -8.0 < model.log_prior(turned, exact, 1.0) < -4.0, "large changes are rare, not impossible"
     fits = [
-        Fit(pose, mean_log, 100, 0.5, 0.1, np.eye(6), model.log_prior(pose, exact, 1.0))
-        for pose, mean_log in ((turned, -2.44), (step, -2.47), (turned, -1.4))
+        Fit(pose, -2.4, 100, 0.5, 0.1, np.eye(6), model.log_prior(pose, exact, 1.0), log_odds)
+        for pose, log_odds in ((turned, 5.2), (step, 5.0), (turned, 15.0))
     ]
-    assert as_likely(fits[1], fits[0]) == 1.0, "the usual motion is more likely"
-    assert as_likely(fits[1], fits[2]) < 0.01, "unless the scan shows the turn"
+    assert as_probable(fits[1], fits[0]) == 1.0, "the usual motion is more probable"
+    assert as_probable(fits[1], fits[2]) < 0.02, "unless the scan shows the turn"
+
+
+def test_the_covariance_of_a_motion_is_at_least_its_own_whatever_the_errors_before_were() -> None:
+    """Where a scan shows the position again that scans before did not show, errors cancel each other."""
+    rng = np.random.default_rng(3)
+    model = MotionModel()
+    for count in range(200):
+        step = geometry.exp(0.3 * rng.standard_normal(6))
+        is_hidden = rng.random(6) < 0.3 * (count > 20)
+        axes = geometry.exp(rng.standard_normal(6))[:3, :3]
+        turned = np.kron(np.eye(2), axes)
+        measured = turned @ np.diag(np.where(is_hidden, 100.0, 1e-4)) @ turned.T
+        own = model.fused(step, measured, 1.0)[1]
+        _, covariance = model.update(step, measured, 1.0)
+        assert np.linalg.eigvalsh(covariance - own).min() > -1e-9 * np.linalg.eigvalsh(covariance).max()
+
+
+@pytest.mark.parametrize(("ratio", "is_lost"), [(1e-7, False), (1e-3, True)])
+def test_a_thin_scan_stays_in_the_map_if_its_pose_leads_over_all_others(
+    monkeypatch: pytest.MonkeyPatch, ratio: float, is_lost: bool
+) -> None:
+    """A scan of few patches has low odds by the score, wherever it is; the motion may have led out of reach."""
+    odometry = _checked(round_drive()[1].T_world_lidar)
+    monkeypatch.setattr(MotionModel, "may_exceed", lambda *_: 0.7)
+    monkeypatch.setattr(PoseSearch, "elsewhere", lambda *_: ratio)
+    monkeypatch.setattr(PoseSearch, "log_odds", lambda *_: -10.0)
+    odometry._map.add(np.eye(4), SeenScan(round_drive()[0][0].points, CONFIG.refine))
+    only = Fit(np.eye(4), -0.4, 160, 0.9, 0.1, np.eye(6))
+    elsewhere, found = odometry._elsewhere(SeenScan(round_drive()[0][1].points, CONFIG.refine), [only], 1.0)
+    assert found is is_lost
+    assert elsewhere == pytest.approx(0.7, abs=0.001), "the covariance does not count on the lead"
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("row", [29, 53, 54])
+def test_a_narrow_view_of_new_surroundings_does_not_slide_back_along_a_wall(data_dir: Path, row: int) -> None:
+    """The scan overlaps the map most at a pose 1.6 to 3.3 m off, where its points fit better on average."""
+    drive = open_dataset(data_dir / "courtyard")
+    assert drive.reference is not None
+    poses = drive.reference.T_world_lidar
+
+    def seen(index: int) -> SeenScan:
+        points = drive[index].points
+        is_ahead = np.abs(np.arctan2(points[:, 1], points[:, 0])) < np.radians(35.0)
+        return SeenScan(points[is_ahead], CONFIG.refine)
+
+    local, scan = LocalMap(CONFIG.refine), seen(row)
+    for index in range(row):
+        local.add(poses[index], seen(index))
+    T_map_last, T_map_lidar = (geometry.inverse(local.T_odom_map) @ poses[index] for index in (row - 1, row))
+    step = geometry.inverse(poses[row - 2]) @ poses[row - 1]
+    search = PoseSearch(lambda source, target: Rejected(RejectReason.HIGH_RESIDUAL), voxel_m=CONFIG.refine.voxel_m)
+    near = search.near(local, scan, [T_map_last @ step, T_map_last])
+    found = search.around(local, scan, T_map_last, step, near)
+    assert geometry.distance(geometry.inverse(T_map_lidar) @ found[0].T_map_lidar) < 0.3
+    assert max(found, key=lambda fit: fit.mean_log) is not found[0], "by the likelihood alone, another"
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -400,7 +458,7 @@ def test_a_motion_is_unsure_by_the_distance_of_two_poses_that_explain_the_scan_a
         search: PoseSearch, local: LocalMap, scan: SeenScan, starts: object, known: object = (), **_: object
     ) -> list[Fit]:
         places = [T_before_now @ geometry.transform(np.eye(3), [0.0, left_m, 0.0]) for left_m in (0.0, 1.2)]
-        return [replace(local.fit(scan, T), mean_log=usual, information=1e4 * np.eye(6)) for T in places]
+        return [replace(local.fit(scan, T), mean_log=usual, log_odds=5.0, information=1e4 * np.eye(6)) for T in places]
 
     monkeypatch.setattr(PoseSearch, "near", two)
     motion = odometry.register(scans[SLIP_AT]).motion

@@ -150,22 +150,25 @@ class CheckedOdometry:
         fits, is_rejoined = self._poses(T_odom_proposed, T_odom_predicted, scan, gap)
         T_odom_map = self._map.T_odom_map
         T_map_proposed = geometry.inverse(T_odom_map) @ T_odom_proposed
-        elsewhere, is_lost = float(is_rejoined), False  # the scan before is not in the map before a break
+        by_chance = 0.0
+        elsewhere = float(is_rejoined)  # the scan before is not in the map before a break
         if not is_rejoined and not self._is_usual(fits):
-            elsewhere, is_lost = self._elsewhere(scan, fits, gap)
+            by_chance = self._by_chance(scan, fits, gap)
+            elsewhere = max(self._search.elsewhere(scan, self._fused(fits, gap)), by_chance)
             if elsewhere * ELSEWHERE_M**2 > BREAK_M**2 or not self._motion.is_known:
                 recognised = self._search.without_guess(self._map, scan)
                 if recognised and (not fits or self._log_ratio(scan, recognised[0], fits[0]) >= 0.0):
-                    fits, elsewhere, is_lost = recognised, 0.0, False
+                    fits, elsewhere, by_chance = recognised, 0.0, 0.0
         best = fits[0] if fits else self._map.fit(scan, T_map_proposed)
         self._usual_fit.note(best.mean_log)
         unsure = self._search.spread(scan, self._fused(fits, gap)) + elsewhere * np.diag(ANYWHERE**2)
         is_unsure = bool(unsure[3:, 3:].max() > BREAK_M**2)
         if not self._inner.is_from_scans and (is_unsure or not self._contradicts(fits, T_map_proposed, scan)):
             return self._kept(T_odom_proposed, T_map_proposed, best, scan, gap, is_unsure=is_unsure)
+        is_lost = elsewhere > 0.5 and not is_rejoined
         T_last_lidar = geometry.nearest_transform(geometry.inverse(self._T_odom_last) @ T_odom_map @ best.T_map_lidar)
         covariance = own = self._covariance(best)
-        if not is_lost:  # else the pose does not show the speed
+        if by_chance < 0.5:  # a pose by chance does not show the speed
             own = self._motion.fused(T_last_lidar, covariance, gap)[1]
             T_last_lidar, covariance = self._motion.update(T_last_lidar, covariance, gap)
         T_odom_lidar, covariance = geometry.nearest_transform(self._T_odom_last @ T_last_lidar), covariance + unsure
@@ -236,20 +239,15 @@ class CheckedOdometry:
             fused.append(replace(fit, T_map_lidar=geometry.inverse(T_last_map) @ T_last_lidar))
         return fused
 
-    def _elsewhere(self, scan: SeenScan, fits: Sequence[Fit], gap: float) -> tuple[float, bool]:
-        """Probability that the scan is far from the most probable pose; and whether it more probably is than not.
+    def _by_chance(self, scan: SeenScan, fits: Sequence[Fit], gap: float) -> float:
+        """Probability that the scan is far from all poses that were tried, so that the best one fits by chance.
 
-        It is at another pose that was tried, or out of their reach: the prior of that is the motion's, the evidence
-        against it the score of loops. By how much the pose leads over the others is evidence, too, for the decision;
-        but at a wrong place that looks like the right one, a pose leads by as much.
+        After a gap the sensor may be anywhere: the prior is that of the motion, the evidence the score of loops.
         """
-        another = self._search.elsewhere(scan, self._fused(fits, gap))
         untried = self._motion.may_exceed(self._search.far_m, gap)
-        if not fits or untried == 0.0:
-            return max(another, untried), max(another, untried) > 0.5
-        by_chance = math.exp(-self._search.log_odds(self._map, scan, fits[0]))
-        is_out_of_reach = untried * another * by_chance > 1.0 - untried
-        return max(another, untried * by_chance / (1.0 + by_chance)), another > 0.5 or is_out_of_reach
+        if not fits or untried < SIGNIFICANT:
+            return untried
+        return untried / (1.0 + math.exp(self._search.log_odds(self._map, scan, fits[0])))
 
     def _contradicts(self, fits: Sequence[Fit], T_map_proposed: Transform, scan: SeenScan) -> bool:
         """True if the most probable pose is significantly more probable than the proposed one, or any near it."""

@@ -103,7 +103,7 @@ class PoseSearch:
         if not fits:
             return 1.0
         far = [fit for fit in fits[1:] if self._apart_m(scan, fits[0], fit) > self.far_m]
-        return as_probable(far[0], fits[0]) if far else 0.0
+        return max((as_likely(fit, fits[0]) for fit in far), default=0.0)
 
     def log_odds(self, local: LocalMap, scan: SeenScan, fit: Fit) -> float:
         """Log odds that a pose is right, by the score of loops (nats)."""
@@ -117,7 +117,7 @@ class PoseSearch:
         for fit in fits[1:]:
             if self._apart_m(scan, fits[0], fit) <= self.far_m:
                 offset = geometry.log(geometry.inverse(fits[0].T_map_lidar) @ fit.T_map_lidar)
-                weight = as_probable(fit, fits[0])
+                weight = as_likely(fit, fits[0])
                 covariance += weight * np.outer(offset, offset)
                 total += weight
         return covariance / total
@@ -137,9 +137,13 @@ class PoseSearch:
         return sorted(judged, key=lambda fit: -_log_posterior(fit))
 
 
-def as_probable(fit: Fit, best: Fit) -> float:
-    """Ratio of the probability of a pose to that of the best one, of those compared; at most 1."""
-    return math.exp(min(0.0, _log_posterior(fit) - _log_posterior(best)))
+def as_likely(fit: Fit, best: Fit) -> float:
+    """How likely the points and the motion make a pose, compared with the best one; at most 1.
+
+    The score, which orders poses, makes some wrong ones too sure: after eleven gaps in NCLT and KITTI 00 the best of
+    wrong poses led by 1 to 29 nats with it.
+    """
+    return math.exp(min(0.0, fit.log_likelihood + fit.log_prior - best.log_likelihood - best.log_prior))
 
 
 def _log_posterior(fit: Fit) -> float:

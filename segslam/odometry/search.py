@@ -29,7 +29,7 @@ explains. Registration reaches half as far."""
 TURNS = (np.zeros(6), *(turn * axis for axis in np.eye(6)[:3] for turn in TURNS_RAD))
 """The same as tangents, with no turn: a sensor that is carried, or a robot on two wheels, turns about any axis."""
 NUM_REGISTERED = 3
-"""Chosen: number of the most likely of these that are registered with all points."""
+"""Chosen: number of the most probable of these that are registered with all points."""
 
 
 def unknown(fit: Fit) -> float:

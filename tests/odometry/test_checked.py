@@ -442,7 +442,7 @@ def test_a_motion_is_unsure_by_the_distance_of_two_poses_that_explain_the_scan_a
         search: PoseSearch, local: LocalMap, scan: SeenScan, starts: object, known: object = (), **_: object
     ) -> list[Fit]:
         places = [T_before_now @ geometry.transform(np.eye(3), [0.0, left_m, 0.0]) for left_m in (0.0, 1.2)]
-        return [replace(local.fit(scan, T), mean_log=usual, log_odds=5.0, information=1e4 * np.eye(6)) for T in places]
+        return [replace(local.fit(scan, T), mean_log=usual, information=1e4 * np.eye(6)) for T in places]
 
     monkeypatch.setattr(PoseSearch, "near", two)
     motion = odometry.register(scans[SLIP_AT]).motion

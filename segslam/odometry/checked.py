@@ -300,13 +300,15 @@ class CheckedOdometry:
         return fits if is_found else []
 
     def _is_found(self, fits: Sequence[Fit], T_map_starts: Sequence[Transform], scan: SeenScan) -> bool:
-        """True if the most likely pose is near one of the starts and explains the scan as usual.
+        """True if the most likely pose is near one of the starts, and explains the scan as usual or has a good score.
 
         A registration that leads away from where it started may have ended at the first of several local optima.
         """
-        return self._is_usual(fits) and any(
-            self._search.is_same(scan, fits[0].T_map_lidar, T_map_start) for T_map_start in T_map_starts
-        )
+        if not any(
+            self._search.is_same(scan, fit.T_map_lidar, T_map_start) for fit in fits[:1] for T_map_start in T_map_starts
+        ):
+            return False
+        return self._is_usual(fits) or self._search.log_odds(self._map, scan, fits[0]) > -math.log(SIGNIFICANT)
 
     def _is_usual(self, fits: Sequence[Fit]) -> bool:
         """True if the most likely pose explains the scan as usual; False if there is none."""

@@ -98,12 +98,17 @@ def _curvature(points: Points, normals: Points, weights: Vector) -> Information:
     In every direction of the tangent, the constraint is compared with that of points without preferred normals. The
     share that noise in the normals explains is subtracted.
     """
-    lever = np.concatenate([np.cross(points[:, None, :], np.eye(3)[None]), np.tile(np.eye(3), (len(points), 1, 1))], 2)
-    along = np.einsum("ni,nij->nj", normals, lever)
+    along = np.column_stack([np.cross(points, normals), normals])
     hessian = (along * weights[:, None]).T @ along
-    rows = (lever * np.sqrt(weights)[:, None, None]).reshape(-1, 6)
-    isotropic = rows.T @ rows + 1e-9 * np.eye(6)
+    isotropic = _of_points(points, weights) + 1e-9 * np.eye(6)
     shares, directions = eigh(hessian, isotropic)
     kept = np.maximum(shares - NORMAL_NOISE, UNOBSERVED)
     half = isotropic @ directions
     return (half * kept) @ half.T
+
+
+def _of_points(points: Points, weights: Vector) -> Information:
+    """Curvature of half the weighted squares of the displacements of points, tangent in their frame."""
+    moment, second = weights @ points, (points * weights[:, None]).T @ points
+    skew = np.cross(np.eye(3), moment)
+    return np.block([[np.trace(second) * np.eye(3) - second, skew], [-skew, weights.sum() * np.eye(3)]])

@@ -16,7 +16,7 @@ from segslam.keyframes import DENSE_VOXELS
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import SEARCH_VOXELS_GICP, LocalMap, SeenScan
 from segslam.odometry.nudge import SEARCH_VOXELS
-from segslam.verification import log_odds
+from segslam.verification import log_odds, most_log_odds
 
 Recover = Callable[[Points, Points], Alignment | Rejected]
 """Registers a source (n, 3) with a target (m, 3) without initial guess, and verifies the result."""
@@ -126,15 +126,24 @@ class PoseSearch:
         return geometry.displacement_m(scan.few, one.T_map_lidar, other.T_map_lidar)
 
     def _compared(self, local: LocalMap, scan: SeenScan, fits: Sequence[Fit]) -> list[Fit]:
-        """The most probable pose first; of poses near each other only the one that explains the scan best."""
+        """The most probable pose first; of poses near each other only the one that explains the scan best.
+
+        Poses that cannot be among the first `NUM_REGISTERED` follow in the order of likelihood and motion.
+        """
         kept: list[Fit] = []
-        for fit in sorted(fits, key=lambda each: -each.log_likelihood - each.log_prior):
+        for fit in sorted(fits, key=lambda each: -_log_without_score(each)):
             if not any(self.is_same(scan, fit.T_map_lidar, other.T_map_lidar) for other in kept):
                 kept.append(fit)
         if len(kept) < 2:
             return kept
-        judged = [replace(fit, log_odds=self.log_odds(local, scan, fit)) for fit in kept]
-        return sorted(judged, key=lambda fit: -_log_posterior(fit))
+        judged: list[Fit] = []
+        for fit in kept:
+            worst = judged[NUM_REGISTERED - 1] if len(judged) >= NUM_REGISTERED else None
+            if worst and _log_posterior(worst) > _log_without_score(fit) + most_log_odds():
+                break  # no score brings this pose or a later one among the first
+            judged.append(replace(fit, log_odds=self.log_odds(local, scan, fit)))
+            judged.sort(key=lambda each: -_log_posterior(each))
+        return [*judged, *kept[len(judged) :]]
 
 
 def as_likely(fit: Fit, best: Fit) -> float:
@@ -143,12 +152,16 @@ def as_likely(fit: Fit, best: Fit) -> float:
     The score, which orders poses, makes some wrong ones too sure: after eleven gaps in NCLT and KITTI 00 the best of
     wrong poses led by 1 to 29 nats with it.
     """
-    return math.exp(min(0.0, fit.log_likelihood + fit.log_prior - best.log_likelihood - best.log_prior))
+    return math.exp(min(0.0, _log_without_score(fit) - _log_without_score(best)))
 
 
 def _log_posterior(fit: Fit) -> float:
     assert fit.log_odds is not None
-    return fit.log_odds + fit.log_likelihood + fit.log_prior
+    return fit.log_odds + _log_without_score(fit)
+
+
+def _log_without_score(fit: Fit) -> float:
+    return fit.log_likelihood + fit.log_prior
 
 
 def _with(prior: Prior, fit: Fit) -> Fit:

@@ -146,4 +146,9 @@ def register_near(
 
 def log_odds(source: Observed, target: Observed, T_target_source: Transform) -> float:
     """Log odds that a pose of the source in the target is right, by what their patches show there (nats)."""
-    return score.shipped().log_odds(patches.agreement(source, target, T_target_source).counts)
+    return score.shipped().log_odds(patches.counts_at(source, target, T_target_source))
+
+
+def most_log_odds() -> float:
+    """The log odds that no pose exceeds (nats)."""
+    return score.shipped().most_log_odds

@@ -93,6 +93,12 @@ def agreement(source: Observed, target: Observed, T_target_source: Transform) ->
     return Agreement(min(overlaps), max(residuals_m), max(violations), *shown)
 
 
+def counts_at(source: Observed, target: Observed, T_target_source: Transform) -> Counts:
+    """The patches of both scans at this pose, in each bin, as `agreement` finds them."""
+    of_source = _seen_from(target, source, T_target_source)[2]
+    return counted(of_source) + counted(_seen_from(source, target, geometry.inverse(T_target_source))[2])
+
+
 def first_look(source: Observed, target: Observed, T_target_source: Transform) -> Shown:
     """The patches of the source alone, in half of the time: a first look at a pose that may still be refined."""
     return _seen_from(target, source, T_target_source)[2]

@@ -83,6 +83,12 @@ class Table:
         """Log odds that an accepted pose has at least, for a share of false ones of `max_false_share` in all."""
         return math.log((1.0 - config.max_false_share) / config.max_false_share) - self.margin
 
+    @property
+    def most_log_odds(self) -> float:
+        """Log odds that no pose exceeds: as unique as poses without any other are, in scans of few patches."""
+        weights = self.weights
+        return weights.shift + weights.slope * (weights.lead * NO_OTHER + weights.lead_offset)
+
     def mean_ratio(self, counts: Counts) -> float:
         """Mean log ratio of a patch (nats); 0 without patches."""
         return float(counts @ self.ratios / max(counts.sum(), 1.0))

@@ -58,23 +58,24 @@ def as_points(shared: Any) -> Points:
     return np.empty((0, 3)) if shared is None else np.frombuffer(shared).reshape(-1, 3)
 
 
-def serve(pipe: Connection, shared: Any, config: KISSConfig) -> None:
+def serve(pipe: Connection, shared: Sequence[Any], config: KISSConfig) -> None:
     """Answer requests until the other side closes the pipe: the name of a method of the aligner, and its arguments.
 
     `begin` gets no answer, and `align_alone` the pose. Points of a sweep are sent themselves or, if they are in the
-    shared memory, as their number.
+    shared memory, as their number: in the first, for `align_alone` in the second.
     """
     keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C and then closes the pipe
     aligner = KissAligner(config)
-    shared_points = as_points(shared)
+    for_align, for_alone = map(as_points, shared)
     try:
         while True:
             name, first, *rest = pipe.recv()
             if name == "begin":
                 aligner = KissAligner(first)
                 continue
-            answer = getattr(aligner, name)(shared_points[:first] if isinstance(first, int) else first, *rest)
+            points = for_alone if name == "align_alone" else for_align
+            answer = getattr(aligner, name)(points[:first] if isinstance(first, int) else first, *rest)
             pipe.send(aligner.alone().pop() if name == "align_alone" else answer)
     except (EOFError, OSError):
         return

@@ -8,14 +8,16 @@ from typing import Any
 
 from kiss_icp.config.parser import KISSConfig
 
+from segslam.core import geometry
 from segslam.core.config import OdometryConfig
 from segslam.core.memory import note_peak_of
-from segslam.core.types import Points, SegslamError, Transform
+from segslam.core.types import BadScan, Points, Scan, SegslamError, Transform
 from segslam.odometry.aligner import KissAligner, as_points, serve
 from segslam.odometry.kiss import KissOdometry, kiss_config
+from segslam.odometry.sweep import Swept, deskew_scan
 
 MOST_SHARED = 2**18
-"""Points that the two processes exchange in shared memory, 6 MB; larger sweeps are sent through the pipe."""
+"""Points of a sweep that the two processes exchange in shared memory, 6 MB; larger ones are sent through the pipe."""
 
 
 class OdometryApart(KissOdometry):
@@ -29,12 +31,37 @@ class OdometryApart(KissOdometry):
     def __init__(self, config: OdometryConfig, *, keeps_alone: bool = False) -> None:
         """`keeps_alone` as for `KissOdometry`; the other process aligns these scans while this one continues."""
         self._apart = _AlignerApart(kiss_config(config))
+        self._foreseen: Swept | None = None
         super().__init__(config, self._apart, keeps_alone=keeps_alone)
 
     def begin(self, config: OdometryConfig) -> None:
         """Start again with other settings, in the same process."""
         self._apart.begin(kiss_config(config))
         super().__init__(config, self._apart, keeps_alone=self._keeps_alone)
+
+    def foresee(self, scan: Scan, *, gap: float) -> None:
+        """Begin to align the next scan, as if the pose of this one stays; `follow` discards the result."""
+        with suppress(BadScan):  # `register` raises it
+            swept = deskew_scan(scan, self._T_last_lidar, self._config)
+            self._apart.begin_to_align(swept[0], geometry.scaled(self._T_last_lidar, gap))
+            self._foreseen = swept
+
+    def follow(
+        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
+    ) -> None:
+        """As `KissOdometry.follow`."""
+        if self._foreseen is not None:
+            T_discarded, self._foreseen = self._apart.begun(), None
+            if self._keeps_alone and not self._has_followed:  # KISS-ICP alone has aligned the next scan with this
+                self._before_following.append(T_discarded)
+                self._is_alone_known = True
+        super().follow(scans, T_odom_lidar, T_before_lidar)
+
+    def _aligned(self, scan: Scan, gap: float) -> tuple[Swept, Transform]:
+        if self._foreseen is None:
+            return super()._aligned(scan, gap)
+        swept, self._foreseen = self._foreseen, None
+        return swept, self._apart.begun()
 
     def __enter__(self) -> "OdometryApart":
         return self
@@ -56,8 +83,8 @@ class _AlignerApart(KissAligner):
         """True while an answer to `align_alone` has not been received."""
         context = multiprocessing.get_context("spawn")  # a fork would copy locks held by other threads
         self._pipe, theirs = context.Pipe()
-        shared = _room_for_points(context)
-        self._shared = as_points(shared)
+        shared = [_room_for_points(context) for _ in range(2)]
+        self._shared, self._shared_alone = map(as_points, shared)
         self._process = context.Process(target=serve, args=(theirs, shared, config), name="odometry", daemon=True)
         self._process.start()
         theirs.close()
@@ -69,17 +96,29 @@ class _AlignerApart(KissAligner):
 
     def align(self, points: Points, T_last_predicted: Transform) -> Transform:
         """As `KissAligner.align`."""
-        return self._exchange("align", self._shared_or_sent(points), T_last_predicted)
+        self.begin_to_align(points, T_last_predicted)
+        return self.begun()
 
     def follow(self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform) -> None:
         """As `KissAligner.follow`."""
         self._exchange("follow", list(scans), T_odom_lidar)
 
+    def begin_to_align(self, points: Points, T_last_predicted: Transform) -> None:
+        """As `align`, whose result `begun` returns; nothing but `alone` may be asked until then."""
+        with self._reported():
+            self._pipe.send(("align", _shared_or_sent(points, self._shared), T_last_predicted))
+
+    def begun(self) -> Transform:
+        """The result of the alignment that was begun."""
+        self.alone()
+        with self._reported():
+            return self._pipe.recv()
+
     def align_alone(self, points: Points, T_last_predicted: Transform) -> None:
         """As `KissAligner.align_alone`; the other process works while this one continues."""
-        sent = self._shared_or_sent(points)
+        self.alone()  # the shared memory is in use until then
         with self._reported():
-            self._pipe.send(("align_alone", sent, T_last_predicted))
+            self._pipe.send(("align_alone", _shared_or_sent(points, self._shared_alone), T_last_predicted))
         self._is_waiting = True
 
     def alone(self) -> list[Transform]:
@@ -89,14 +128,6 @@ class _AlignerApart(KissAligner):
             with self._reported():
                 self._alone.append(self._pipe.recv())
         return self._alone
-
-    def _shared_or_sent(self, points: Points) -> Points | int:
-        """The number of the points, which are then in the shared memory, or the points if they are too many."""
-        self.alone()  # the shared memory is in use until then
-        if len(points) > len(self._shared):
-            return points
-        self._shared[: len(points)] = points
-        return len(points)
 
     def _exchange(self, *request: Any) -> Any:
         self.alone()
@@ -123,6 +154,14 @@ class _AlignerApart(KissAligner):
         note_peak_of(self._process.pid)
         self._pipe.close()
         self._process.join()
+
+
+def _shared_or_sent(points: Points, shared: Points) -> Points | int:
+    """The number of the points, which are then in the shared memory, or the points if they are too many."""
+    if len(points) > len(shared):
+        return points
+    shared[: len(points)] = points
+    return len(points)
 
 
 def _room_for_points(context: SpawnContext) -> Any:

@@ -70,11 +70,16 @@ class CheckedOdometry:
         self._offs: deque[float] = deque(maxlen=WINDOW)
         """Chi-squares of the odometry's poses, compared with registered ones, since the last repair."""
 
-    def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
-        """The checked pose and the cropped points of the next scan. `gap` and BadScan as for the inner odometry."""
+    def register(self, scan: Scan, *, gap: float = 1.0, ahead: Scan | None = None) -> OdometryResult:
+        """The checked pose and the cropped points of the next scan. `gap` and BadScan as for the inner odometry.
+
+        `ahead`: the scan to be registered after it, if it is known.
+        """
         gap = max(gap, self._intervals.gap(scan.stamp_ns))
         proposed = self._inner.register(scan, gap=gap)
         self._intervals.note(scan.stamp_ns)
+        if ahead is not None and ahead.stamp_ns > scan.stamp_ns:
+            self._inner.foresee(ahead, gap=self._intervals.gap(ahead.stamp_ns))
         if not self._config.health.check:
             return proposed
         seen = SeenScan(proposed.points, self._refine)

@@ -11,7 +11,7 @@ from segslam.core import geometry
 from segslam.core.config import OdometryConfig
 from segslam.core.types import BadScan, Points, Scan, Transform
 from segslam.odometry.aligner import KissAligner
-from segslam.odometry.sweep import OdometryResult, deskew_scan
+from segslam.odometry.sweep import OdometryResult, Swept, deskew_scan
 
 
 class KissOdometry:
@@ -27,6 +27,8 @@ class KissOdometry:
         self._aligner = aligner or KissAligner(kiss_config(config))
         self._keeps_alone, self._has_followed = keeps_alone, False
         self._before_following: list[Transform] = []
+        self._is_alone_known = False
+        """True if the pose of the next scan by KISS-ICP alone is kept already."""
         self._last_gap = 1.0
         self._T_odom_last = self._T_last_lidar = np.eye(4)
 
@@ -35,13 +37,20 @@ class KissOdometry:
 
         Raises BadScan, and ignores the scan, if none of its points is within range.
         """
-        points, labels, intensities = deskew_scan(scan, self._T_last_lidar, self._config)
-        T_odom_lidar = self._aligner.align(points, geometry.scaled(self._T_last_lidar, gap))
+        (points, labels, intensities), T_odom_lidar = self._aligned(scan, gap)
         if self._keeps_alone:
             self._register_alone(scan, points, T_odom_lidar, gap)
         self._T_last_lidar = geometry.scaled(_since(self._T_odom_last, T_odom_lidar), 1 / gap)
         self._T_odom_last = T_odom_lidar
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
+
+    def foresee(self, scan: Scan, *, gap: float) -> None:
+        """Nothing begins: this process is busy with the check of the scan before."""
+
+    def _aligned(self, scan: Scan, gap: float) -> tuple[Swept, Transform]:
+        """The points of the next scan, and its pose."""
+        swept = deskew_scan(scan, self._T_last_lidar, self._config)
+        return swept, self._aligner.align(swept[0], geometry.scaled(self._T_last_lidar, gap))
 
     def follow(
         self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
@@ -59,6 +68,8 @@ class KissOdometry:
         """Keep the pose by KISS-ICP alone; `points` and the pose are those of the scan here."""
         if not self._has_followed:
             self._before_following.append(T_odom_lidar)
+        elif self._is_alone_known:
+            self._is_alone_known = False
         else:
             before, last = [np.eye(4), np.eye(4), *self.alone()][-2:]
             T_last_lidar = geometry.scaled(_since(before, last), 1 / self._last_gap)

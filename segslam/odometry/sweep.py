@@ -49,6 +49,10 @@ class Odometry(Protocol):
         """
         ...
 
+    def foresee(self, scan: Scan, *, gap: float) -> None:
+        """The scan to be registered next, with this `gap`, is known: work on it may begin while this one is checked."""
+        ...
+
     def follow(
         self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
     ) -> None:
@@ -59,9 +63,11 @@ class Odometry(Protocol):
         ...
 
 
-def deskew_scan(
-    scan: Scan, T_last_lidar: Transform, config: OdometryConfig
-) -> tuple[Points, ScanLabels, Vector | None]:
+Swept = tuple[Points, ScanLabels, Vector | None]
+"""Points (n, 3) float64, their labels and intensities, as `deskew_scan` returns them."""
+
+
+def deskew_scan(scan: Scan, T_last_lidar: Transform, config: OdometryConfig) -> Swept:
     """Points (n, 3) float64 as measured at the end of the sweep and within range; their labels and intensities.
 
     Points are cropped after the motion compensation, as in KISS-ICP, which would crop without the labels.
@@ -120,6 +126,9 @@ class GivenOdometry:
         )
         self._T_odom_given, self._T_odom_last, self._T_given_last = T_odom_given, T_odom_lidar, T_given_lidar
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
+
+    def foresee(self, scan: Scan, *, gap: float) -> None:
+        """There is no work to begin."""
 
     def follow(
         self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform

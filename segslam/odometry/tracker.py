@@ -52,12 +52,13 @@ class Tracker:
         self._num_tracked = 0
         self._last_stamp_ns: int | None = None
 
-    def track(self, scan: Scan, *, gap: float = 1.0) -> Tracked:
+    def track(self, scan: Scan, *, gap: float = 1.0, ahead: Scan | None = None) -> Tracked:
         """Estimate the pose of a scan, and decide whether it becomes a keyframe.
 
         `gap`: time since the previous scan in intervals of the sensor; above 1 if scans between them were lost. It
-        scales the constant-velocity prediction of the odometry. Raises BadScan, and ignores the scan, if it cannot be
-        used or is not later than the previous scan.
+        scales the constant-velocity prediction of the odometry. `ahead`: the scan that is tracked next, without a gap,
+        if it is known; the odometry then works on both at the same time, with the same results. Raises BadScan, and
+        ignores the scan, if it cannot be used or is not later than the previous scan.
         """
         if self._last_stamp_ns is not None and scan.stamp_ns <= self._last_stamp_ns:
             raise BadScan(
@@ -68,7 +69,7 @@ class Tracker:
         scan = replace(scan, index=index)
         watch = Stopwatch()
         with watch("odometry"):
-            registered = self._odometry.register(scan, gap=gap)
+            registered = self._odometry.register(scan, gap=gap, ahead=ahead)
         registered = replace(registered, T_odom_lidar=self._T_odom_own @ registered.T_odom_lidar)
         self._last_stamp_ns = scan.stamp_ns
         self._num_tracked += 1

@@ -7,6 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import chain, pairwise
 from pathlib import Path
 from statistics import median
 from time import perf_counter
@@ -317,7 +318,11 @@ class Run:
         )
         return {} if found is None else {"vertical_deg": found.angle_deg, "vertical_sigma_deg": found.sigma_deg}
 
-    def _read(self, dataset: Dataset) -> Iterator[Scan | BadScan]:
+    def _read(self, dataset: Dataset) -> Iterator[tuple[Scan | BadScan, Scan | BadScan | None]]:
+        """Each scan, and the one after it."""
+        yield from pairwise(chain(self._scans(dataset), [None]))
+
+    def _scans(self, dataset: Dataset) -> Iterator[Scan | BadScan]:
         for row in range(self._next_row, len(dataset)):
             started = perf_counter()
             try:
@@ -327,9 +332,12 @@ class Run:
             self._note_ms("read", perf_counter() - started)
             yield scan
 
-    def _track(self, scan: Scan | BadScan) -> Tracked | BadScan:
+    def _track(self, scans: tuple[Scan | BadScan, Scan | BadScan | None]) -> Tracked | BadScan:
+        scan, ahead = scans
+        if isinstance(scan, BadScan):
+            return scan
         try:
-            return scan if isinstance(scan, BadScan) else self._slam.track(scan)
+            return self._slam.track(scan, ahead=ahead if isinstance(ahead, Scan) else None)
         except BadScan as error:
             return error
 

@@ -102,11 +102,14 @@ class Slam:
         """
         return self.close_loops(self.track(scan))
 
-    def track(self, scan: Scan) -> Tracked:
-        """Estimate the pose of a scan, and decide whether it becomes a keyframe. Raises BadScan as `process` does."""
+    def track(self, scan: Scan, *, ahead: Scan | None = None) -> Tracked:
+        """Estimate the pose of a scan, and decide whether it becomes a keyframe. Raises BadScan as `process` does.
+
+        `ahead`: the scan that is tracked next, if it is known: saves time.
+        """
         if self._is_finished:
             raise SegslamError(f"scan {scan.index}: the run is finished; map further scans with a new Slam")
-        return self._tracker.track(scan)
+        return self._tracker.track(scan, ahead=ahead)
 
     def close_loops(self, tracked: Tracked, *, tries_loops: bool = True) -> Step:
         """Close the loops of a tracked scan. Loops that are not tried now may be tried in the search of `finish`."""

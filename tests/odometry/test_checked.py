@@ -380,6 +380,50 @@ def test_a_narrow_view_of_new_surroundings_does_not_slide_back_along_a_wall(data
     assert max(found, key=lambda fit: fit.mean_log) is not found[0], "by the likelihood alone, another"
 
 
+def test_poses_that_no_score_brings_among_the_first_are_not_scored(monkeypatch: pytest.MonkeyPatch) -> None:
+    scans, truth = round_drive()
+    local = LocalMap(CONFIG.refine)
+    local.add(truth.T_world_lidar[0], SeenScan(scans[0].points, CONFIG.refine))
+    scan = SeenScan(scans[1].points, CONFIG.refine)
+    search = PoseSearch(lambda source, target: Rejected(RejectReason.HIGH_RESIDUAL), voxel_m=CONFIG.refine.voxel_m)
+    apart = [geometry.transform(geometry.yaw(turn), [0.0, 0.0, 0.0]) for turn in np.radians([0.0, 90.0, 180.0, 270.0])]
+    fits = [local.fit(scan, T_map_lidar) for T_map_lidar in apart]
+    likely = [replace(fit, mean_log=0.001 * number) for number, fit in enumerate(fits)]
+    far = [replace(fit, T_map_lidar=fit.T_map_lidar @ geometry.transform(np.eye(3), [9.0, 0.0, 0.0])) for fit in fits]
+    unlikely = [replace(fit, mean_log=-9.0) for fit in far]
+    scored: list[np.ndarray] = []
+    odds = {
+        id(fit.T_map_lidar): value
+        for fit, value in zip([*likely, *unlikely], (1.0, 3.0, 2.0, 0.0, *[30.0] * 4), strict=True)
+    }
+
+    def scored_by(source: object, target: object, T_map_lidar: np.ndarray) -> float:
+        scored.append(T_map_lidar)
+        return odds[id(T_map_lidar)]
+
+    monkeypatch.setattr("segslam.odometry.search.log_odds", scored_by)
+    order = search.near(local, scan, [], [*unlikely, *likely])
+    assert [id(fit.T_map_lidar) for fit in order[:4]] == [id(likely[number].T_map_lidar) for number in (1, 2, 0, 3)]
+    assert len(order) == 8
+    assert len(scored) == 4
+
+
+@pytest.mark.parametrize(("log_odds", "is_searched"), [(20.0, False), (1.0, True)])
+def test_a_scan_of_an_unusual_fit_is_searched_around_unless_its_score_is_good(
+    monkeypatch: pytest.MonkeyPatch, log_odds: float, is_searched: bool
+) -> None:
+    scans, truth = round_drive()
+    odometry = _checked(truth.T_world_lidar)
+    _registered(odometry, scans[:SLIP_AT])
+    searched: list[object] = []
+    monkeypatch.setattr(odometry, "_is_usual", lambda fits: False)
+    monkeypatch.setattr(odometry._search, "log_odds", lambda *_: log_odds)
+    monkeypatch.setattr(odometry._search, "around", lambda local, scan, *_, **__: searched.append(scan) or [])
+    T_odom_lidar = geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[SLIP_AT]
+    odometry._poses(T_odom_lidar, T_odom_lidar, SeenScan(scans[SLIP_AT].points, CONFIG.refine), 1.0)
+    assert bool(searched) is is_searched
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_scan_that_no_proposal_explains_is_tried_with_turns_about_each_axis(axis: int) -> None:
     starts: list[np.ndarray] = []

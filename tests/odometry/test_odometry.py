@@ -121,6 +121,34 @@ def test_the_poses_of_kiss_icp_alone_are_kept_while_the_odometry_follows_others(
     assert geometry.distance(geometry.inverse(found[-1].T_odom_lidar) @ expected[-1]) > 0.1
 
 
+def _followed(odometry: KissOdometry, scans: list[Scan], *, foresees: bool) -> list[np.ndarray]:
+    """Poses of scans, of which the fourth and the sixth are moved; the third is not foreseen."""
+    found = []
+    for number, scan in enumerate(scans):
+        found.append(odometry.register(scan))
+        if foresees and number + 1 < len(scans) and number != 1:
+            odometry.foresee(scans[number + 1], gap=1.0)
+        if number in (3, 5):
+            T_moved = geometry.transform(np.eye(3), [0.5, 0.1, 0.0]) @ found[-1].T_odom_lidar
+            odometry.follow([(T_moved, found[-1].points)], T_moved, np.eye(4))
+    return [result.T_odom_lidar for result in found]
+
+
+def test_work_on_the_next_scan_begins_early_and_changes_nothing() -> None:
+    scans = [*_street(7), _scan(np.zeros((1, 3)), index=7)]
+    with OdometryApart(ONE_THREAD, keeps_alone=True) as plain, OdometryApart(ONE_THREAD, keeps_alone=True) as early:
+        expected = _followed(plain, scans[:-1], foresees=False)
+        found = _followed(early, scans[:-1], foresees=True)
+        early.foresee(scans[-1], gap=1.0)
+        with pytest.raises(BadScan, match="scan 7: none of its 1 points"):
+            early.register(scans[-1])
+    with OdometryApart(ONE_THREAD) as without_alone:
+        np.testing.assert_array_equal(_followed(without_alone, scans[:-1], foresees=True), expected)
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(early.alone(), plain.alone())
+    assert len(without_alone.alone()) == 0
+
+
 def test_a_sweep_too_large_for_the_shared_memory_is_aligned_like_any_other(monkeypatch: pytest.MonkeyPatch) -> None:
     scans = _street(3)
     monkeypatch.setattr("segslam.odometry.apart.MOST_SHARED", 100)

@@ -8,7 +8,7 @@ import pytest
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.registration.prepared import Observed, prepare_observed
-from segslam.verification.patches import BINS, KINDS, agreement, first_look, patches_of
+from segslam.verification.patches import BINS, KINDS, agreement, counts_at, first_look, patches_of
 
 CONFIG = Config()
 
@@ -46,6 +46,12 @@ def test_at_the_true_pose_patches_lie_on_the_surfaces_of_the_other_scan() -> Non
     assert found.overlap > 0.95
     assert found.rms_m < 0.05
     assert found.free_space_violation < 0.01
+
+
+@pytest.mark.parametrize("along_m", [0.0, 3.0, 500.0])
+def test_patches_are_counted_alike_without_the_rest_of_the_agreement(along_m: float) -> None:
+    moved = geometry.transform(geometry.yaw(0.3), [along_m, 0.5, 0.0])
+    np.testing.assert_array_equal(counts_at(_room(1), _room(2), moved), agreement(_room(1), _room(2), moved).counts)
 
 
 def test_patches_are_in_free_space_or_hidden_behind_what_the_other_scan_saw() -> None:

@@ -30,6 +30,17 @@ def _wrong_and_lost(table: Table) -> tuple[float, float]:
     return float(is_accepted[~is_right].mean()), float(1.0 - is_accepted[is_right].mean())
 
 
+def test_no_pose_exceeds_the_most_log_odds() -> None:
+    rng = np.random.default_rng(0)
+    table = shipped()
+    seen = [
+        np.bincount(rng.choice(len(BINS), 200, p=rng.dirichlet(np.full(len(BINS), 0.05))), minlength=len(BINS))
+        for _ in range(500)
+    ]
+    odds = [table.log_odds(counts.astype(float) * size / 200) for counts in seen for size in (1, 50, 300, 2000)]
+    assert table.most_log_odds - 6.0 < max(odds) < table.most_log_odds
+
+
 def test_on_stored_pairs_hardly_a_wrong_pose_is_accepted_and_few_right_ones_are_lost() -> None:
     """625 wrong poses, each the best of a pair: three are accepted, two of them of scans of one place."""
     wrong, lost = _wrong_and_lost(shipped())

@@ -58,8 +58,9 @@ class CheckedOdometry:
         self._shared = geometry.tangent(rotation_rad=math.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M)
         self._map = LocalMap(config.refine)
         self._search = PoseSearch(recover, voxel_m=config.refine.voxel_m)
-        self._lost: tuple[LocalMap, int] | None = None
-        """The map before a break, in which the next scans are tried, and the number of scans since then."""
+        self._lost: tuple[LocalMap, Transform, int] | None = None
+        """The map before a break, in which the next scans are tried, the motion per interval there, and the number of
+        scans since then."""
         self._intervals = Intervals()
         self._motion = MotionModel()
         self._usual_check, self._usual_fit = Usual(), Usual()
@@ -171,6 +172,7 @@ class CheckedOdometry:
         if not self._inner.is_from_scans and (is_unsure or not self._contradicts(fits, T_map_proposed, scan)):
             return self._kept(T_odom_proposed, T_map_proposed, best, scan, gap, is_unsure=is_unsure)
         is_lost = elsewhere > 0.5 and not is_rejoined
+        T_step_before = self._motion.T_step
         T_last_lidar = geometry.nearest_transform(geometry.inverse(self._T_odom_last) @ T_odom_map @ best.T_map_lidar)
         covariance = own = self._covariance(best)
         if by_chance < 0.5:  # a pose by chance does not show the speed
@@ -183,7 +185,7 @@ class CheckedOdometry:
         if state is MotionState.CONFIRMED:
             T_odom_lidar = T_odom_proposed
         if is_lost:
-            self._lost = self._lost or (self._map, 0)
+            self._lost = self._lost or (self._map, T_step_before, 0)
             self._map = LocalMap(self._refine)
             self._motion.begin_map()
         self._map.add(T_odom_lidar, scan)
@@ -289,19 +291,21 @@ class CheckedOdometry:
     ) -> list[Fit]:
         """Poses in the map before a break, if it explains the scan as usual and at least as well as `here`.
 
-        It is then the local map again. `here`: the poses in the present local map.
+        It is then the local map again. `here`: the poses in the present local map. The break may have been a scan that
+        nothing explains; the motion before it then continued.
         """
         if self._lost is None:
             return []
-        local, num_scans = self._lost
+        local, T_step, num_scans = self._lost
         T_map_odom = geometry.inverse(local.T_odom_map)
-        starts = [T_map_odom @ T_odom_proposed, T_map_odom @ T_odom_predicted, np.eye(4)]
+        T_continued = geometry.scaled(T_step, num_scans + 2.0)
+        starts = [T_map_odom @ T_odom_proposed, T_map_odom @ T_odom_predicted, np.eye(4), T_continued]
         near = self._search.near(local, scan, starts)
-        fits = self._search.around(local, scan, np.eye(4), self._motion.T_step, near)
+        fits = self._search.around(local, scan, np.eye(4), T_step, near)
         is_found = self._is_usual(fits) and (not here or fits[0].mean_log >= here[0].mean_log)
         if is_found:
             self._map = local
-        self._lost = None if is_found or num_scans + 1 >= WINDOW else (local, num_scans + 1)
+        self._lost = None if is_found or num_scans + 1 >= WINDOW else (local, T_step, num_scans + 1)
         return fits if is_found else []
 
     def _is_found(self, fits: Sequence[Fit], T_map_starts: Sequence[Transform], scan: SeenScan) -> bool:

@@ -85,7 +85,8 @@ class PoseSearch:
             for turn in TURNS
         ]
         reached = [local.approach(scan, T_map_start) for T_map_start in starts]
-        found = self._compared(local, scan, [*known, *(_with(prior, fit) for fit in reached if fit is not None)])
+        found = [*known, *(_with(prior, fit) for fit in reached if fit is not None)]
+        found = self._compared(local, scan, found, num_ordered=NUM_REGISTERED + len(known))
         T_map_known = [fit.T_map_lidar for fit in known]
         others = [fit.T_map_lidar for fit in found if not any(fit.T_map_lidar is other for other in T_map_known)]
         registered = [fit for T_map_start in others[:NUM_REGISTERED] for fit in local.register(scan, T_map_start)]
@@ -125,10 +126,10 @@ class PoseSearch:
     def _apart_m(self, scan: SeenScan, one: Fit, other: Fit) -> float:
         return geometry.displacement_m(scan.few, one.T_map_lidar, other.T_map_lidar)
 
-    def _compared(self, local: LocalMap, scan: SeenScan, fits: Sequence[Fit]) -> list[Fit]:
+    def _compared(self, local: LocalMap, scan: SeenScan, fits: Sequence[Fit], *, num_ordered: int = 1) -> list[Fit]:
         """The most probable pose first; of poses near each other only the one that explains the scan best.
 
-        Poses that cannot be among the first `NUM_REGISTERED` follow in the order of likelihood and motion.
+        So many poses are in order; the others follow, of which those that cannot be among these are not scored.
         """
         kept: list[Fit] = []
         for fit in sorted(fits, key=lambda each: -_log_without_score(each)):
@@ -138,9 +139,9 @@ class PoseSearch:
             return kept
         judged: list[Fit] = []
         for fit in kept:
-            worst = judged[NUM_REGISTERED - 1] if len(judged) >= NUM_REGISTERED else None
-            if worst and _log_posterior(worst) > _log_without_score(fit) + most_log_odds():
-                break  # no score brings this pose or a later one among the first
+            last = judged[num_ordered - 1] if len(judged) >= num_ordered else None
+            if last and _log_posterior(last) > _log_without_score(fit) + most_log_odds():
+                break  # no score brings this pose or a later one before it
             judged.append(replace(fit, log_odds=self.log_odds(local, scan, fit)))
             judged.sort(key=lambda each: -_log_posterior(each))
         return [*judged, *kept[len(judged) :]]

@@ -49,7 +49,7 @@ def test_at_the_true_pose_patches_lie_on_the_surfaces_of_the_other_scan() -> Non
 
 
 @pytest.mark.parametrize("along_m", [0.0, 3.0, 500.0])
-def test_patches_are_counted_alike_without_the_rest_of_the_agreement(along_m: float) -> None:
+def test_patches_are_counted_without_what_else_two_scans_show(along_m: float) -> None:
     moved = geometry.transform(geometry.yaw(0.3), [along_m, 0.5, 0.0])
     np.testing.assert_array_equal(counts_at(_room(1), _room(2), moved), agreement(_room(1), _room(2), moved).counts)
 

@@ -101,10 +101,10 @@ def evaluate(
 def _score_run(
     folder: Path, reference_file: Path | None, how: Scoring, plot: Path | None, terminal: Terminal
 ) -> dict[str, Any]:
-    from segslam.core.trajectory import rows_of_same_scan
     from segslam.output.accuracy import accuracy, scores
     from segslam.output.finished import ACCURACY, plain_name, read_run, true_poses
     from segslam.output.folder import folder_of, write_metrics
+    from segslam.run.evaluate import matched_poses
 
     folder = folder_of(folder)
     check_links(folder)
@@ -113,8 +113,7 @@ def _score_run(
     if reference is None:
         raise SegslamError(f"{folder}: the data has no ground-truth poses; give a file with --reference")
     figures = accuracy(run.result, reference)
-    trajectory = run.result.trajectory
-    num_scans = len(trajectory)
+    num_scans = len(run.result.trajectory)
     if "ate_m" not in figures:
         raise SegslamError(
             f"{reference_file or folder}: only {len(reference)} of {num_scans} scans have a pose; three are needed"
@@ -123,8 +122,7 @@ def _score_run(
         terminal.say(f"scored the {len(reference)} of {num_scans} scans that have a reference pose")
     metrics = {key: value for key, value in run.metrics.items() if plain_name(key) not in ACCURACY}
     metrics |= figures
-    rows = rows_of_same_scan(trajectory.scan_index, reference.scan_index)
-    matched, truth = trajectory.T_world_lidar[rows[:, 0]], reference.T_world_lidar[rows[:, 1]]
+    matched, truth = matched_poses(run.result.trajectory, reference)
     if how.align == "se3":
         write_metrics(folder, metrics)
     if plot is not None:
@@ -162,7 +160,7 @@ def _score_files(
     from segslam.core.evaluation import UP, upward_axis
     from segslam.core.trajectory import read_poses
     from segslam.output.accuracy import scores
-    from segslam.run.evaluate import matching_rows
+    from segslam.run.evaluate import matched_poses
 
     estimate, reference = (read_poses(file, format=how.format) for file in (estimate_file, reference_file))
     if (estimate.stamp_ns is None) != (reference.stamp_ns is None):
@@ -174,8 +172,7 @@ def _score_files(
             f"{estimate_file}: {len(estimate)} poses, but {reference_file} has {len(reference)}; in KITTI format "
             "line n + 1 is scan n in both. Score the run folder instead, or use TUM format, which is matched by stamp"
         )
-    rows = matching_rows(estimate, reference, max_difference_ns=round(how.max_difference * 1e9))
-    matched, truth = estimate.T_a_b[rows[:, 0]], reference.T_a_b[rows[:, 1]]
+    matched, truth = matched_poses(estimate, reference, max_difference_ns=round(how.max_difference * 1e9))
     up, why = how.up, ""
     if up is None:
         up, why = upward_axis(truth), "the path is flattest along it"
@@ -186,7 +183,7 @@ def _score_files(
     figures = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance, up=UP[up])
     if not figures:
         raise SegslamError(
-            f"{estimate_file}: only {len(rows)} of its {len(estimate)} poses match one of the {len(reference)} "
+            f"{estimate_file}: only {len(matched)} of its {len(estimate)} poses match one of the {len(reference)} "
             f"poses of {reference_file}; at least three are needed. Check the files, or raise --max-difference"
         )
     if why:
@@ -195,6 +192,6 @@ def _score_files(
         from segslam.output.report.comparison import draw_scored
 
         draw_scored(plot, matched, truth, up=up)
-    if not len(rows) == len(estimate) == len(reference):
-        terminal.say(f"scored {len(rows)} poses; estimate {len(estimate)}, reference {len(reference)}")
-    return figures | {"num_poses": len(rows), "up": up}
+    if not len(matched) == len(estimate) == len(reference):
+        terminal.say(f"scored {len(matched)} poses; estimate {len(estimate)}, reference {len(reference)}")
+    return figures | {"num_poses": len(matched), "up": up}

@@ -6,7 +6,7 @@ import numpy as np
 
 from segslam.core.evaluation import Z_UP
 from segslam.core.trajectory import PoseFile, Poses, read_poses, rows_of_same_scan, rows_of_same_stamp
-from segslam.core.types import IndexPairs, SegslamError, Trajectory
+from segslam.core.types import SegslamError, Trajectory
 from segslam.output.accuracy import Align, scores
 from segslam.output.finished import STAMP_TOLERANCE_NS, FinishedRun
 
@@ -32,15 +32,10 @@ def evaluate(
         reference = estimate.reference if isinstance(estimate, FinishedRun) else None
         if reference is None:
             raise SegslamError("evaluate: no ground truth; give `reference`")
-    made, true = _known(estimate), _known(reference)
-    rows = matching_rows(made, true)
-    matched, truth = (
-        (known.T_world_lidar if isinstance(known, Trajectory) else known.T_a_b)[own]
-        for known, own in zip((made, true), rows.T, strict=True)
-    )
+    matched, truth = matched_poses(_known(estimate), _known(reference))
     figures = scores(matched, truth, align=align, rpe_distance_m=rpe_distance_m, up=up)
     if not figures:
-        raise SegslamError(f"evaluate: only {len(rows)} poses match the reference; at least three are needed")
+        raise SegslamError(f"evaluate: only {len(matched)} poses match the reference; at least three are needed")
     return figures
 
 
@@ -57,14 +52,17 @@ def _known(given: Given) -> Trajectory | PoseFile:
     return PoseFile(poses, None)
 
 
-def matching_rows(
+def matched_poses(
     made: Trajectory | PoseFile, true: Trajectory | PoseFile, *, max_difference_ns: int = STAMP_TOLERANCE_NS
-) -> IndexPairs:
-    """(k, 2) rows of the same scan or time, else all rows. Raises SegslamError for unequal numbers of rows."""
+) -> tuple[Poses, Poses]:
+    """Poses of the same scan or time, else row by row. Raises SegslamError for unequal numbers of rows."""
+    T_made, T_true = (known.T_world_lidar if isinstance(known, Trajectory) else known.T_a_b for known in (made, true))
     if isinstance(made, Trajectory) and isinstance(true, Trajectory):
-        return rows_of_same_scan(made.scan_index, true.scan_index)
-    if made.stamp_ns is not None and true.stamp_ns is not None:
-        return rows_of_same_stamp(made.stamp_ns, true.stamp_ns, max_difference_ns=max_difference_ns)
-    if len(made) != len(true):
+        rows = rows_of_same_scan(made.scan_index, true.scan_index)
+    elif made.stamp_ns is not None and true.stamp_ns is not None:
+        rows = rows_of_same_stamp(made.stamp_ns, true.stamp_ns, max_difference_ns=max_difference_ns)
+    elif len(made) == len(true):
+        return T_made, T_true
+    else:
         raise SegslamError(f"evaluate: {len(made)} poses for {len(true)} true ones; without stamps give one for each")
-    return np.column_stack([np.arange(len(made)), np.arange(len(made))])
+    return T_made[rows[:, 0]], T_true[rows[:, 1]]

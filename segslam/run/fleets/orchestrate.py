@@ -11,11 +11,10 @@ from typing import Any
 from segslam.core.types import SegslamError, WorkFailed
 from segslam.core.whole_files import write_whole
 from segslam.run.fleets import steps
-from segslam.run.fleets.drives import Drive, drives_of, key_of, read_drives
+from segslam.run.fleets.drives import Drive, drives_of, read_drives
 from segslam.run.fleets.relations import Components
 from segslam.run.fleets.steps import Mapped
 from segslam.run.fleets.workers import Outcome, Workers, workers
-from segslam.run.sessions.recorded import SessionPose
 from segslam.run.sessions.session_pose import MIN_FOUND, Relation
 from segslam.slam.adjustment import Progress, no_progress
 
@@ -126,10 +125,7 @@ class _Fleet:
 
     def _proposed(self, mapped: Sequence[Mapped]) -> dict[tuple[int, int], list[tuple[int, float]]]:
         """Keyframes of a drive that look most like places of an earlier one, by the numbers of both."""
-        tasks = [
-            (self._folder, drive, mapped[:number], key_of([one.key for one in mapped[: number + 1]]))
-            for number, drive in enumerate(mapped)
-        ]
+        tasks = [(self._folder, drive, mapped[:number]) for number, drive in enumerate(mapped)]
         numbers = {drive.name: number for number, drive in enumerate(mapped)}
         proposals: dict[tuple[int, int], list[tuple[int, float]]] = {}
         for later, outcome in enumerate(self._all("propose", steps.propose, tasks)):
@@ -146,8 +142,7 @@ class _Fleet:
             tasks = []
             for later, earlier in pairs:
                 queries = [keyframe_id for keyframe_id, _ in proposals[later, earlier]]
-                key = key_of(mapped[later].key, mapped[earlier].key, queries)
-                tasks.append((self._folder, mapped[later], mapped[earlier], queries, key))
+                tasks.append((self._folder, mapped[later], mapped[earlier], queries))
             for pair, outcome in zip(pairs, self._all("relate", steps.relate, tasks), strict=True):
                 relation: Relation = _value(outcome, mapped[pair[0]])
                 components.add(*pair, relation)
@@ -162,7 +157,7 @@ class _Fleet:
         for number, (order, poses) in enumerate(components.arranged()):
             drives = [mapped[drive] for drive in order]
             folder = self._folder / f"component_{number}"
-            tasks.append((folder, drives, poses, _key(drives, poses, same), same))
+            tasks.append((folder, drives, poses, same))
             made.append({"folder": folder.name, "drives": [drive.name for drive in drives]})
         for one, outcome in zip(made, self._all("join", steps.join, tasks), strict=True):
             figures = outcome.value or {}
@@ -178,15 +173,6 @@ def _value(outcome: Outcome, drive: Mapped) -> Any:
     if outcome.failure is not None:
         raise WorkFailed(f"{drive.name}: {outcome.failure}; call `segslam fleet` again to go on")
     return outcome.value
-
-
-def _key(drives: Sequence[Mapped], poses: Sequence[SessionPose | None], same: bool) -> str:
-    """A line for each drive, which depends on it and on those before: a component of the first has the first lines."""
-    lines = [""]
-    for drive, pose in zip(drives, poses, strict=True):
-        related = pose and [pose.earlier, pose.T_earlier_world.tolist()]
-        lines.append(key_of(lines[-1], drive.key, related, same))
-    return "\n".join(lines[1:])
 
 
 def _write(result: FleetResult) -> None:

@@ -24,8 +24,8 @@ from segslam.gnss.reading import read_fixes
 from segslam.output.finished import read_metrics
 from segslam.output.folder import write_poses
 from segslam.output.georeferenced import georeference, summary
-from segslam.output.log import RunLog, read_log
-from segslam.run.fleets.drives import Drive
+from segslam.output.log import read_log
+from segslam.run.fleets.drives import Drive, key_of
 from segslam.run.fleets.kept import Alignments, KeptAlignment, part_of, read_kept, write_kept
 from segslam.run.locator import Locator
 from segslam.run.map_folder import given_odometry, map_folder, open_scans
@@ -71,16 +71,11 @@ def _made_with(folder: Path) -> str:
         return ""
 
 
-def is_made(folder: Path, key: str) -> bool:
-    """True if a folder is whole and was made with this key."""
-    return _made_with(folder) == key
-
-
 def map_drive(fleet: Path, drive: Drive) -> Mapped:
     """Map a drive into its run folder, as `segslam map` does. Raises SegslamError, as that does."""
     mapped = Mapped(drive.name, drive.key(version("segslam")))
     folder = mapped.folder(fleet)
-    if is_made(folder, mapped.key):
+    if _made_with(folder) == mapped.key:
         return mapped
     part = _beside(folder)
     names = ("sequence", "dataset", "labels", "encoding", "frames", "topic")
@@ -128,8 +123,9 @@ def index_drive(fleet: Path, drive: Mapped) -> Mapped:
     return drive
 
 
-def propose(fleet: Path, drive: Mapped, earlier: Sequence[Mapped], key: str) -> Likely:
+def propose(fleet: Path, drive: Mapped, earlier: Sequence[Mapped]) -> Likely:
     """For each earlier drive, the keyframes of this one that look most like one of its places, by its name."""
+    key = key_of([one.key for one in (*earlier, drive)])
     file = fleet / PROPOSALS / f"{drive.name}-{key}.json"
     if not file.exists():
         proposed = _proposed(fleet, drive, earlier)
@@ -153,9 +149,9 @@ def _proposed(fleet: Path, drive: Mapped, earlier: Sequence[Mapped]) -> Likely:
     }
 
 
-def relate(fleet: Path, later: Mapped, earlier: Mapped, queries: Sequence[int], key: str) -> Relation:
+def relate(fleet: Path, later: Mapped, earlier: Mapped, queries: Sequence[int]) -> Relation:
     """The pose of a drive in an earlier one, from its keyframes that look like places there."""
-    file = fleet / PAIRS / f"{later.name} at {earlier.name}-{key}.json"
+    file = fleet / PAIRS / f"{later.name} at {earlier.name}-{key_of(later.key, earlier.key, queries)}.json"
     if not file.exists():
         session, known = (read_session(one.folder(fleet)) for one in (later, earlier))
         locator = _locator(fleet, earlier)
@@ -165,10 +161,11 @@ def relate(fleet: Path, later: Mapped, earlier: Mapped, queries: Sequence[int], 
 
 
 def join(
-    folder: Path, drives: Sequence[Mapped], poses: Sequence[SessionPose | None], key: str, same_reference: bool
+    folder: Path, drives: Sequence[Mapped], poses: Sequence[SessionPose | None], same_reference: bool
 ) -> Mapping[str, Any]:
     """The drives of a component as one run in a folder of the fleet, by the pose of each in one before; its figures."""
-    if not is_made(folder, key):
+    before, key = _made_with(folder), _component_key(drives, poses, same_reference)
+    if before != key:
         part, fleet = _beside(folder), folder.parent
         sessions = [read_session(drive.folder(fleet)) for drive in drives]
         if len(drives) == 1:
@@ -183,8 +180,10 @@ def join(
                 for drive, one in zip(drives, sessions, strict=True)
             ]
             kept = Alignments(fleet / ALIGNMENTS, parts)
-            before = _before(folder, key)
-            together = write_merged(merged, part, config, kept=kept, before=before).result.trajectory
+            # the component before is extended if it has two or more drives, the first of these
+            is_extended = len(before.splitlines()) > 1 and key.startswith(before)
+            log = read_log(folder) if is_extended else None
+            together = write_merged(merged, part, config, kept=kept, before=log).result.trajectory
             for file, alignments in kept.changed():
                 _replace(file, partial(write_kept, kind=tuple[KeptAlignment, ...], value=alignments))
         _write_drives(part / "drives", drives, sessions, together)
@@ -192,10 +191,13 @@ def join(
     return read_metrics(folder)
 
 
-def _before(folder: Path, key: str) -> RunLog | None:
-    """The component that is replaced, if it has two or more drives, the first of the new one."""
-    made = _made_with(folder)
-    return read_log(folder) if len(made.splitlines()) > 1 and key.startswith(made) else None
+def _component_key(drives: Sequence[Mapped], poses: Sequence[SessionPose | None], same_reference: bool) -> str:
+    """A line for each drive, which depends on it and on those before: a component of the first has the first lines."""
+    lines = [""]
+    for drive, pose in zip(drives, poses, strict=True):
+        related = pose and [pose.earlier, pose.T_earlier_world.tolist()]
+        lines.append(key_of(lines[-1], drive.key, related, same_reference))
+    return "\n".join(lines[1:])
 
 
 def _write_drives(folder: Path, drives: Sequence[Mapped], sessions: Sequence[Session], together: Trajectory) -> None:
@@ -223,7 +225,7 @@ def _beside(target: Path) -> Path:
 def _made(part: Path, folder: Path, key: str) -> None:
     """A whole folder takes its final name, in place of one that was made with another key."""
     (part / KEY).write_text(key, encoding="utf-8")
-    if is_made(folder, key):
+    if _made_with(folder) == key:
         shutil.rmtree(part)
         return
     if folder.exists():

@@ -31,12 +31,6 @@ Workers = Callable[[Callable[..., Any], Sequence[tuple[Any, ...]]], Iterator[tup
 """Calls a function with several tuples of arguments; yields the number and outcome of each task when it is done."""
 
 
-def here(function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> Iterator[tuple[int, Outcome]]:
-    """One task after the other, in this process."""
-    for number, task in enumerate(tasks):
-        yield number, attempted(function, *task)
-
-
 def attempted(function: Callable[..., Any], *arguments: Any) -> Outcome:
     """The outcome of one task. A bug, too, is the failure of one task, with its traceback in the worker's log.
 
@@ -67,7 +61,7 @@ def workers(folder: Path, *, number: int, scheduler: str | None) -> Iterator[tup
     has another version or does not see the folder.
     """
     if scheduler is None and number == 1:
-        yield here, ""
+        yield lambda function, tasks: ((number, attempted(function, *task)) for number, task in enumerate(tasks)), ""
         return
     import dask
 

@@ -59,8 +59,11 @@ class Merged:
             if (found := session.found) is not None
         )
 
-    def options(self) -> dict[str, str]:
-        """For the log: the merged runs, and the offsets of their numbers."""
+    def begun(self, folder: Path, config: Config, *, kept: Kept = nothing_kept) -> Run:
+        """The merged run in its folder, before it takes over the first of `steps`. `kept`: as for `write_merged`.
+
+        The log has the merged runs, and the offsets of their numbers.
+        """
         rows = [
             {
                 "run": str(session.run.folder.resolve()),
@@ -71,17 +74,13 @@ class Merged:
             }
             for session in self.sessions
         ]
-        return {"sessions": json.dumps(rows)}
-
-    def begun(self, folder: Path, config: Config, *, kept: Kept = nothing_kept) -> Run:
-        """The merged run in its folder, before it takes over the first of `steps`. `kept`: as for `write_merged`."""
         return Run(
             folder,
             Slam(config, known=known_of(self.sessions, kept)),
             dataset=" + ".join(dict.fromkeys(session.run.dataset for session in self.sessions)),
             T_camera_lidar=self.sessions[0].run.T_camera_lidar,
             reference=self.reference,
-            options=self.options(),
+            options={"sessions": json.dumps(rows)},
         )
 
     def steps(self, before: RunLog | None = None) -> Iterator[StepToTake]:

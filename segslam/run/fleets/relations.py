@@ -1,6 +1,5 @@
 """Relative poses of drives: inverted, and chained to the poses of a component."""
 
-from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from heapq import heappop, heappush
@@ -8,7 +7,7 @@ from heapq import heappop, heappush
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.types import LoopClosure, Registration
+from segslam.core.types import LoopClosure, Registration, Transform
 from segslam.graph.closure_pairs import adjoints
 from segslam.run.sessions.recorded import SessionPose
 from segslam.run.sessions.session_pose import MOST_FAILED, Relation
@@ -34,7 +33,8 @@ class Components:
     def __init__(self, num_drives: int) -> None:
         self._component = list(range(num_drives))
         """Of each drive: the number of the first drive of its component."""
-        self._relations: dict[tuple[int, int], Relation] = {}
+        self._related: list[dict[int, tuple[Transform, tuple[LoopClosure, ...]]]] = [{} for _ in range(num_drives)]
+        """Of each drive: its pose in others, and the loops by which it was found there."""
         self._tried = set[tuple[int, int]]()
         self._num_failed = [0] * num_drives
         """By component: pairs that could not be joined since its last drive was."""
@@ -47,7 +47,9 @@ class Components:
             self._num_failed[self._component[later]] += 1
         if relation.T_earlier_later is None or one == other:
             return
-        self._relations[later, earlier] = relation
+        inverse = geometry.inverse(relation.T_earlier_later), tuple(map(inverted, relation.found))
+        self._related[later][earlier] = relation.T_earlier_later, relation.found
+        self._related[earlier][later] = inverse
         self._component = [one if own == other else own for own in self._component]
         self._num_failed[one] = 0
 
@@ -56,30 +58,17 @@ class Components:
 
         Of the drives that may be next the first is, so that one that is added to a fleet is the last if it can be.
         """
-        related = defaultdict[int, list[int]](list)
-        for later, earlier in self._relations:
-            related[later].append(earlier)
-            related[earlier].append(later)
         for first in sorted(set(self._component)):
             order, poses = list[int](), list[SessionPose | None]()
             waiting = [(first, -1)]
             while waiting:
                 drive, number = heappop(waiting)
                 if drive not in order:
-                    for other in related[drive]:
+                    for other in self._related[drive]:
                         heappush(waiting, (other, len(order)))
-                    poses.append(self._pose(drive, order[number], number) if order else None)
+                    poses.append(SessionPose(number, *self._related[drive][order[number]]) if order else None)
                     order.append(drive)
             yield order, poses
-
-    def _pose(self, drive: int, before: int, number: int) -> SessionPose:
-        """The pose of a drive in one that it is related to, which has this number in the order."""
-        relation = self._relations.get((drive, before)) or self._relations[before, drive]
-        assert relation.T_earlier_later is not None
-        if (drive, before) in self._relations:
-            return SessionPose(number, relation.T_earlier_later, relation.found)
-        found = tuple(inverted(one) for one in relation.found)
-        return SessionPose(number, geometry.inverse(relation.T_earlier_later), found)
 
     def next_pairs(self, similarity: Mapping[tuple[int, int], float]) -> list[tuple[int, int]]:
         """For each component its most similar pair with an earlier drive of another one, of those not tried yet.

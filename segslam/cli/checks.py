@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from segslam.cli.console import Terminal
+from segslam.cli.dry_run import first_usable
 from segslam.cli.options import Settings
 from segslam.core.errors import SegslamError
 from segslam.core.whole_files import check_target
@@ -88,8 +89,6 @@ def check_links(folder: Path) -> None:
 
 def check_intensities(scans: "Dataset") -> None:
     """Raises SegslamError if the first readable scan has no intensities."""
-    from segslam.cli.dry_run import first_usable
-
     if first_usable(scans)[1].intensities is None:
         raise SegslamError(f"map.color=intensity: {scans.name} has no intensities; use class or height")
 
@@ -133,8 +132,6 @@ def is_finished(recorded: "RunLog", scans: "Dataset") -> bool:
     result = recorded.result()
     if result is None or not (recorded.path.parent / "report.html").is_file():  # the last file that a run writes
         return False
-    from segslam.cli.dry_run import first_usable
-
     last = int(result[1].scan_index[-1])  # scans are read only if the last one is missing
     return last == int(scans.scan_index[-1]) or last == int(scans.scan_index[first_usable(scans, backwards=True)[0]])
 

@@ -77,6 +77,7 @@ def live(
     configs = live_configs(preset, output)
     from segslam.labels.label_files import unlabelled
     from segslam.run.live.front import Front
+    from segslam.run.map_folder import in_effect
     from segslam.run.run import Run
     from segslam.slam.slam import Slam
 
@@ -104,8 +105,7 @@ def live(
             settings = configs[chosen.preset]
             if preset == "auto":
                 show_preset(chosen.preset, chosen.extent_m, terminal)
-        sensor = settings.sensor.model_copy(update={"vertical_angle_deg": angle_deg})
-        settings = settings.model_copy(update={"sensor": sensor})
+        settings = in_effect(settings, angle_deg)
         slam = Slam(settings, labeller=(lambda points: unlabelled(len(points))) if labels == "none" else None)
         mirror = server.send if server else None
         run = stack.enter_context(Run(out, slam, dataset=source.name, options=recorded, mirror=mirror))

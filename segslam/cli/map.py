@@ -21,6 +21,7 @@ from segslam.cli.checks import (
     preset_config,
 )
 from segslam.cli.console import Terminal, how_to_go_on, print_json, say
+from segslam.cli.dry_run import found_in, lines
 from segslam.cli.ending import finish, is_interrupted, map_summary
 from segslam.cli.options import DataArgument, GnssOptions, RunOptions, RunOutput, ViewOption
 from segslam.cli.viewers import check_display, scene_in, serve_foxglove
@@ -183,8 +184,6 @@ def map_data(
         settings = output.load(base=preset_config(options.preset, scans, terminal))
     given = given_odometry(options.odometry, scans, settings.odometry) if options.odometry else None
     if dry_run:
-        from segslam.cli.dry_run import found_in, lines
-
         found = found_in(scans, settings)
         terminal.table(found, lines(found))
         return
@@ -200,7 +199,7 @@ def map_data(
         output,
         terminal,
         inputs=(data, in_map, options.odometry),
-        settings=in_effect(settings, scans),
+        settings=in_effect(settings, scans.vertical_angle_deg),
         odometry=given,
         options=choices,
         recorded=recorded,

@@ -53,7 +53,7 @@ def map_folder(
     """
     source = DataSource(Path(data), sequence, dataset, labels, encoding, frames, topic)
     scans = open_scans(source, config or Config())
-    config = in_effect(config or preset(preset_for(extent_m(scans))), scans)
+    config = in_effect(config or preset(preset_for(extent_m(scans))), scans.vertical_angle_deg)
     folder = new_folder(Path(out))
     own = {"odometry": odometry, "slam_of": None if slam_of is Slam or "in_map" in options else slam_of}
     not_resumed = [name for name, value in own.items() if value is not None]
@@ -107,9 +107,9 @@ def open_scans(source: DataSource, config: Config) -> Dataset:
     return replace(source, intensities=by_intensity, vertical_angle_deg=config.sensor.vertical_angle_deg).open()
 
 
-def in_effect(settings: Config, scans: Dataset) -> Config:
-    """The settings, with the vertical angle of the data set if they do not define one."""
-    sensor = settings.sensor.model_copy(update={"vertical_angle_deg": scans.vertical_angle_deg})
+def in_effect(settings: Config, vertical_angle_deg: float) -> Config:
+    """The settings, with the vertical angle by which scans are corrected on reading; they may not define one."""
+    sensor = settings.sensor.model_copy(update={"vertical_angle_deg": vertical_angle_deg})
     return settings.model_copy(update={"sensor": sensor})
 
 

@@ -69,26 +69,24 @@ def messages(path: Path, *, since_last: str | None = None) -> Iterator[Stored]:
             ids = {channel.id for channel in channels.values() if channel.topic == since_last}
             holding = (chunk for chunk in summary.chunk_indexes if ids & chunk.message_index_offsets.keys())
             start = max((chunk.chunk_start_offset for chunk in holding), default=0)
-        for offset, size, outer in _records(stream, start):
-            for record in _records_of_chunk(offset, outer) if isinstance(outer, Chunk) else ():
-                if isinstance(record, Schema):
-                    schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    channels[record.id] = record
-                elif isinstance(record, Message):
-                    channel = channels.get(record.channel_id)
-                    if channel is None or channel.schema_id not in schemas:
-                        raise CutError(offset)
-                    yield Stored(channel.topic, schemas[channel.schema_id], record.data, channel.id, (offset, size))
+        for offset, size, record in _records_of_chunks(stream, start):
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                channel = channels.get(record.channel_id)
+                if channel is None or channel.schema_id not in schemas:
+                    raise CutError(offset)
+                yield Stored(channel.topic, schemas[channel.schema_id], record.data, channel.id, (offset, size))
 
 
 def message_within(records: bytes, channel_id: int) -> bytes | None:
     """Data of the first message of a channel in records of a log; None without one before the end, or a damage."""
     with suppress(CutError):
-        for offset, _, outer in _records(BytesIO(MCAP0_MAGIC + records)):
-            for record in _records_of_chunk(offset, outer) if isinstance(outer, Chunk) else ():
-                if isinstance(record, Message) and record.channel_id == channel_id:
-                    return record.data
+        for _, _, record in _records_of_chunks(BytesIO(MCAP0_MAGIC + records)):
+            if isinstance(record, Message) and record.channel_id == channel_id:
+                return record.data
     return None
 
 
@@ -177,11 +175,16 @@ def _record(offset: int, opcode: int, body: bytes) -> object:
     return record
 
 
-def _records_of_chunk(offset: int, chunk: Chunk) -> list[object]:
-    try:
-        allocated = frame_content_size(chunk.data) if chunk.compression == "zstd" else 0  # as zstd will do
-        if max(chunk.uncompressed_size, allocated) > _MOST_CHUNK_BYTES:
-            raise CutError(offset)
-        return list(breakup_chunk(chunk, validate_crc=True))
-    except _DAMAGE as error:
-        raise CutError(offset) from error
+def _records_of_chunks(stream: IO[bytes] | BytesIO, start: int = 0) -> Iterator[tuple[int, int, object]]:
+    """Each record in the chunks of a file from `start`, with offset and size of its chunk. Raises as `_records`."""
+    for offset, size, chunk in _records(stream, start):
+        if not isinstance(chunk, Chunk):
+            continue
+        try:
+            allocated = frame_content_size(chunk.data) if chunk.compression == "zstd" else 0  # as zstd will do
+            if max(chunk.uncompressed_size, allocated) > _MOST_CHUNK_BYTES:
+                raise CutError(offset)
+            records = list(breakup_chunk(chunk, validate_crc=True))
+        except _DAMAGE as error:
+            raise CutError(offset) from error
+        yield from ((offset, size, record) for record in records)

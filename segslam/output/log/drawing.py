@@ -128,10 +128,8 @@ class Drawing:
                 yield schema.TRAJECTORY, foxglove.path(poses, stamp_ns=stamp_ns)
 
     def _attempts(self, attempts: tuple[LoopAttempt, ...], stamp_ns: int) -> Iterator[Topical]:
-        accepted, rejected = (
-            [self._attempt(one, stamp_ns) for one in attempts if isinstance(one.outcome, Rejected) is wanted]
-            for wanted in (False, True)
-        )
+        accepted = [self._attempt(one, stamp_ns) for one in attempts if isinstance(one.outcome, LoopClosure)]
+        rejected = [self._attempt(one, stamp_ns) for one in attempts if isinstance(one.outcome, Rejected)]
         if accepted:
             yield schema.ACCEPTED, foxglove.scene(accepted)
         if outdated := self._rejected & {entity.id for entity in accepted}:  # loops that waited for confirmation

@@ -61,16 +61,16 @@ class Optimized:
         return not self.doubts
 
 
-def optimize_graph(graph: G2oGraph, *, robust: Robust = "consistent", inlier_probability: float = 0.99) -> Optimized:
+def optimize_graph(graph: G2oGraph, *, robust: Robust = "consistent") -> Optimized:
     """The optimum of a graph near the file's poses or, where those are a bad guess, near chordal poses.
 
     Edges between consecutive ids count as odometry and are always kept, unless several between the same two contradict
     each other: then they are closures, too. All others are closures: kept (`none`), under a robust kernel, or kept or
     rejected by graduated non-convexity (`gnc`) or starting from a pairwise-consistent set (`consistent`). The bound of
-    inliers is a chi-square that all of them are below with `inlier_probability`.
+    inliers is a chi-square that all of them are below with `noise.INLIER_PROBABILITY`.
     If odometry alone does not connect the graph, `gnc` raises SegslamError, and `consistent` falls back to `cauchy`.
     """
-    problem = FileProblem.of(graph, inlier_probability)
+    problem = FileProblem.of(graph)
     robust = _possible(robust, graph, problem)
     start = values_of(graph.T_world_vertex.values(), graph.T_world_vertex)
     backbone = gtsam.NonlinearFactorGraph()
@@ -78,7 +78,7 @@ def optimize_graph(graph: G2oGraph, *, robust: Robust = "consistent", inlier_pro
         backbone.add(gtsam.PriorFactorPose3(vertex, start.atPose3(vertex), noise.first_pose()))
     backbone.push_back(factor_graph(problem.odometry))
     started = perf_counter()
-    found, weights = _solve(problem, backbone, start, robust, inlier_probability)
+    found, weights = _solve(problem, backbone, start, robust)
     return _described(graph, problem, start, found, weights > 0.0, robust, perf_counter() - started)
 
 
@@ -100,11 +100,7 @@ def _possible(robust: Robust, graph: G2oGraph, problem: FileProblem) -> Robust:
 
 
 def _solve(
-    problem: FileProblem,
-    backbone: gtsam.NonlinearFactorGraph,
-    start: gtsam.Values,
-    robust: Robust,
-    inlier_probability: float,
+    problem: FileProblem, backbone: gtsam.NonlinearFactorGraph, start: gtsam.Values, robust: Robust
 ) -> tuple[Search, Vector]:
     """The poses, and the weight of each closure: 0 if it was rejected."""
     everything = np.ones(len(problem.closures))
@@ -112,7 +108,7 @@ def _solve(
         truncated = gnc.TruncatedProblem(backbone, problem.closures, problem.inlier_bound, everything)
         solution = gnc.solve(truncated, start) if robust == "gnc" else select(problem, truncated, start)
         return solution.search, solution.weights
-    kernel = noise.robust_kernel(robust, noise.inlier_bound(inlier_probability))
+    kernel = noise.robust_kernel(robust, noise.inlier_bound())
     factors = joined(backbone, factor_graph(problem.closures, kernel=kernel))
     if kernel is None:
         return least_squares(factors, start, redundancy=problem.redundancy(len(everything))), everything

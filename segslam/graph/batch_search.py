@@ -30,8 +30,6 @@ GOOD_START = 0.5
 """The file's poses are a start of their own where this share of the closures fits them. Chosen."""
 GENEROUS = 4.0
 """Closures with an error below this many bounds are also tried as inliers. Chosen: twice the error of an inlier."""
-
-
 CONSISTENT = 0.999
 """Two correct measurements of one motion differ by less than this quantile of the chi-square distribution. Chosen."""
 
@@ -48,17 +46,17 @@ class FileProblem:
     contradicting: list[list[Edge]]
     """Edges between the same neighbours that contradict each other."""
     inlier_bound: float
-    """Chi-square that all closures, if all are inliers, are below with the given probability."""
+    """Chi-square that all closures, if all are inliers, are below with `noise.INLIER_PROBABILITY`."""
 
     @classmethod
-    def of(cls, graph: G2oGraph, inlier_probability: float) -> "FileProblem":
+    def of(cls, graph: G2oGraph) -> "FileProblem":
         """The edges of a graph."""
         groups = contradicting([edge for edge in graph.edges if abs(edge.a - edge.b) == 1])
         moved = {id(edge) for edges in groups for edge in edges}
         odometry = [edge for edge in graph.edges if abs(edge.a - edge.b) == 1 and id(edge) not in moved]
         odometry += [replace(edges[0], information=noise.UNKNOWN_MOTION) for edges in groups]
         closures = [edge for edge in graph.edges if abs(edge.a - edge.b) != 1 or id(edge) in moved]
-        each = 1.0 - (1.0 - inlier_probability) / max(1, len(closures))
+        each = 1.0 - (1.0 - noise.INLIER_PROBABILITY) / max(1, len(closures))
         return cls(len(graph.T_world_vertex), odometry, closures, groups, noise.inlier_bound(each))
 
     def redundancy(self, num_closures: int) -> int:

@@ -84,10 +84,6 @@ class TruncatedProblem:
         """(k,) 1 for each closure within the bound, else 0."""
         return (self.squared_errors(values) <= self.inlier_bound).astype(float)
 
-    def cost(self, error: float, weights: Vector) -> float:
-        """The truncated cost of a solution, from the error of the factors that it keeps."""
-        return error + 0.5 * self.inlier_bound * float(self.penalties[weights == 0.0].sum())
-
     def weighted(self, weights: Vector) -> gtsam.NonlinearFactorGraph:
         """The least-squares problem in which closure i has its information times `weights[i]`."""
         graph = gtsam.NonlinearFactorGraph(self.backbone)
@@ -151,7 +147,8 @@ def settle(problem: TruncatedProblem, values: gtsam.Values, iterations: int = 0)
         within = problem.inliers(values)
         if (within == weights).all():
             break
-    return Solution(found._replace(iterations=iterations), weights, problem.cost(found.error, weights))
+    rejection_cost = 0.5 * problem.inlier_bound * float(problem.penalties[weights == 0.0].sum())
+    return Solution(found._replace(iterations=iterations), weights, found.error + rejection_cost)
 
 
 def select_consistent(problem: TruncatedProblem, start: gtsam.Values, consistent: Pairs, near: Pairs) -> Solution:

@@ -3,12 +3,12 @@
 As long as the odometry is sound, a scan every `keyframes.distance_m` is compared with the previous one in a few
 milliseconds. If this contradicts the motion, the scan is registered with the last scans from several proposals: the
 odometry's motion and the last motion; and, if no pose near a proposal explains the scan as scans of this drive usually
-are explained, no motion, poses all around, and place recognition. The most likely pose is kept; where several explain
-the scan nearly as well, that is the one with the usual motion. At the start, after a repair, and while its poses differ
-from the last registrations by more than these are unsure, every scan is registered. After a repair the odometry
-continues from the local map; smaller corrections leave it undisturbed. They are added to its following poses while
-every scan is registered; else they are taken as errors that it corrects itself. A scan with too few points to show its
-motion moves on as the last ones did.
+are explained or has a good score, no motion and poses all around, and by place recognition. The most likely pose is
+kept; where several explain the scan nearly as well, that is the one with the usual motion. At the start, after a
+repair, and while its poses differ from the last registrations by more than these are unsure, every scan is registered.
+After a repair the odometry continues from the local map; smaller corrections leave it undisturbed. They are added to
+its following poses while every scan is registered; else they are taken as errors that it corrects itself. A scan with
+too few points to show its motion moves on as the last ones did.
 """
 
 import math
@@ -313,9 +313,7 @@ class CheckedOdometry:
 
         A registration that leads away from where it started may have ended at the first of several local optima.
         """
-        if not any(
-            self._search.is_same(scan, fit.T_map_lidar, T_map_start) for fit in fits[:1] for T_map_start in T_map_starts
-        ):
+        if not fits or not any(self._search.is_same(scan, fits[0].T_map_lidar, T_start) for T_start in T_map_starts):
             return False
         return self._is_usual(fits) or self._search.log_odds(self._map, scan, fits[0]) > -math.log(SIGNIFICANT)
 

@@ -36,7 +36,8 @@ ANYWHERE = geometry.tangent(rotation_rad=np.radians(60.0), translation_m=ELSEWHE
 """Chosen: standard deviations of a motion that no pose explains: the sensor may have been carried anywhere nearby."""
 SIGNIFICANT = 0.001
 """Chosen: an odometry of other sensors is overruled where its pose is less likely than this, given the scans, and less
-likely motions are not considered; and KISS-ICP is off where chance explains its distance from a registration with less.
+likely motions are not considered; KISS-ICP is off where chance explains its distance from a registration with less;
+and a pose has a good score if its odds of being wrong are less.
 The adjustment has the same share of chance for a sweep that scans show, for surfaces that become thicker, and for a
 pose out of reach of an alignment."""
 MOST_OFF = float(chi2.isf(SIGNIFICANT, 6))

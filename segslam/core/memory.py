@@ -34,8 +34,22 @@ _together_mb = 0.0
 
 def note_peak_of(pid: int | None) -> None:
     """Note the peak memory of another process, before it ends, for `peak_mb` (Linux only)."""
+    note_peak_with(status_mb("VmHWM", pid) or 0.0)
+
+
+def note_peak_with(more_mb: float) -> None:
+    """Note for `peak_mb` that other processes needed so much beside this one."""
     global _together_mb
-    _together_mb = max(_together_mb, _own_peak_mb() + (status_mb("VmHWM", pid) or 0.0))
+    _together_mb = max(_together_mb, _own_peak_mb() + more_mb)
+
+
+def peak_of_copy_mb() -> float:
+    """Peak memory of this process, a copy of another one, that the two do not share (MB, Linux only); 0 if unknown."""
+    try:
+        private = re.findall(r"Private_\w+:\s*(\d+) kB", Path("/proc/self/smaps_rollup").read_text(encoding="ascii"))
+    except OSError:
+        return 0.0
+    return sum(map(int, private)) / 1024 + (status_mb("VmHWM") or 0.0) - (status_mb("VmRSS") or 0.0)
 
 
 def status_mb(key: str, pid: int | str | None = "self") -> float | None:

@@ -58,15 +58,16 @@ class Usual:
         self._values: deque[float] = deque(maxlen=WINDOW)
 
     def includes(self, value: float, *, least_spread: float) -> bool:
-        """True if the value is not below the median by more than three standard deviations; False if none is known.
+        """True if the value is not below the median by more than three standard deviations; False if none is known."""
+        return bool(self._values) and value >= median(self._values) - 3.0 * max(self.spread, least_spread)
 
-        The standard deviation is that of a normal distribution with the same median absolute deviation.
-        """
+    @property
+    def spread(self) -> float:
+        """Standard deviation of a normal distribution with the same median absolute deviation; 0 if none is known."""
         if not self._values:
-            return False
+            return 0.0
         middle = median(self._values)
-        spread = 1.4826 * median(abs(other - middle) for other in self._values)
-        return value >= middle - 3.0 * max(spread, least_spread)
+        return 1.4826 * median(abs(other - middle) for other in self._values)
 
     def note(self, value: float) -> None:
         """Add a value."""

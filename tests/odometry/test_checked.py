@@ -19,7 +19,7 @@ from segslam.odometry.checked import CheckedOdometry
 from segslam.odometry.kiss import KissOdometry
 from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.local_map import LocalMap, SeenScan
-from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, information_of
+from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, Usual, information_of
 from segslam.odometry.nudge import CHECK_VOXELS, nudge
 from segslam.odometry.search import PoseSearch, as_likely
 from segslam.odometry.sweep import GivenOdometry, OdometryResult
@@ -283,7 +283,7 @@ def test_the_local_map_is_given_up_where_a_scan_is_more_probably_elsewhere(
     none = Rejected(RejectReason.HIGH_RESIDUAL)
     odometry = CheckedOdometry(_LikeKiss(truth, CONFIG.odometry), CONFIG, recover=lambda source, target: none)
     _registered(odometry, scans[:SLIP_AT])
-    monkeypatch.setattr(odometry, "_is_usual", lambda fits: False)
+    monkeypatch.setattr(odometry, "_is_usual", lambda fits, **_: False)
     monkeypatch.setattr(odometry._search, "elsewhere", lambda scan, fits: probability)
     motion = odometry.register(scans[SLIP_AT]).motion
     assert motion is not None
@@ -419,11 +419,32 @@ def test_a_scan_of_an_unusual_fit_is_searched_around_unless_its_score_is_good(
     odometry = _checked(truth.T_world_lidar)
     _registered(odometry, scans[:SLIP_AT])
     searched: list[object] = []
-    monkeypatch.setattr(odometry, "_is_usual", lambda fits: False)
+    monkeypatch.setattr(odometry, "_is_usual", lambda fits, **_: False)
     monkeypatch.setattr(odometry._search, "log_odds", lambda *_: log_odds)
     monkeypatch.setattr(odometry._search, "around", lambda local, scan, *_, **__: searched.append(scan) or [])
     T_odom_lidar = geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[SLIP_AT]
     odometry._poses(T_odom_lidar, T_odom_lidar, SeenScan(scans[SLIP_AT].points, CONFIG.refine), 1.0)
+    assert bool(searched) is is_searched
+
+
+@pytest.mark.parametrize(("spread", "is_searched"), [(0.0, True), (1.0, False)])
+def test_fits_may_vary_as_much_as_those_of_the_checks(
+    spread: float, is_searched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scans, truth = round_drive()
+    odometry = _checked(truth.T_world_lidar)
+    _registered(odometry, scans[:SLIP_AT])
+    T_odom_lidar = geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[SLIP_AT]
+    seen = SeenScan(scans[SLIP_AT].points, CONFIG.refine)
+    found = odometry._map.fit(seen, geometry.inverse(odometry._map.T_odom_map) @ T_odom_lidar)
+    odometry._usual_fit, odometry._usual_check = Usual(), Usual()
+    for sign in (-1.0, 1.0):
+        odometry._usual_fit.note(found.mean_log + 1.0)
+        odometry._usual_check.note(sign * spread)
+    searched: list[object] = []
+    monkeypatch.setattr(odometry._search, "log_odds", lambda *_: 1.0)
+    monkeypatch.setattr(odometry._search, "around", lambda local, scan, *_, **__: searched.append(scan) or [])
+    odometry._poses(T_odom_lidar, T_odom_lidar, seen, 1.0)
     assert bool(searched) is is_searched
 
 

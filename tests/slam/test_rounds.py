@@ -1,5 +1,7 @@
 """A drive along a walled yard, whose odometry bends."""
 
+import os
+import threading
 from functools import cache
 
 import numpy as np
@@ -84,8 +86,10 @@ def test_an_adjustment_after_which_surfaces_are_thicker_is_dropped(
     assert "surfaces of the map were thinner before the adjustment" in caplog.text
 
 
-@pytest.mark.slow
-def test_the_adjustment_repeats_exactly() -> None:
+@pytest.mark.parametrize("cores", [1, 3])
+def test_the_adjustment_is_the_same_on_any_number_of_cores(cores: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    monkeypatch.setattr(threading, "active_count", lambda: 1)  # those of pytest do not matter here
     again = graph()
     adjust(again, again.finish(), points, STILL, config=CONFIG)
     np.testing.assert_array_equal(again.T_world_keyframes, straightened()[0].T_world_keyframes)

@@ -139,7 +139,7 @@ def cut_heights(path_m: Points, clouds: Iterable[Points]) -> Vector:
     lowest_m = path_m[:, 2].min()
     for cloud in clouds:
         points = cloud[cloud[:, 2] > lowest_m + LOWEST_M]  # others are over no position
-        away_m, row = tree.query(points[:, :2], distance_upper_bound=BESIDE_M)
+        away_m, row = tree.query(points[:, :2], distance_upper_bound=BESIDE_M, workers=-1)
         beside = np.isfinite(away_m)
         above_m = points[beside, 2] - path_m[row[beside], 2]
         over = above_m > LOWEST_M

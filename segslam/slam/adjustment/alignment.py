@@ -8,7 +8,7 @@ alignment (Gauss and Newton, one step from the best pose), and how much the pair
 that are aligned with the distortion, a part of it does not show.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from segslam.core import geometry
 from segslam.core.kernels import kernel
+from segslam.core.processes import in_parts
 from segslam.core.trajectory import Poses
 from segslam.core.types import Information, Points, Transform, Vector
 from segslam.registration.refinement import LightSurface
@@ -103,18 +104,20 @@ class Shown(NamedTuple):
 
 
 def shown(
-    pairs: Iterable[tuple[int, int]], surface_of: Callable[[int], LightSurface], T_world: Poses, corrects: Corrects
+    pairs: Sequence[tuple[int, int]], surface_of: Callable[[int], LightSurface], T_world: Poses, corrects: Corrects
 ) -> Shown | None:
     """The corrections by all pairs (target, source); None if fewer than `MIN_PAIRS` are aligned, or none can be seen.
 
     `T_world` (n, 4, 4): poses of the keyframes.
     """
-    found = []
-    for ids in pairs:
-        target, source = map(surface_of, ids)
-        aligned = align(source, target, geometry.inverse(T_world[ids[0]]) @ T_world[ids[1]])
-        if aligned is not None:
-            found.append(_of_pair(ids, source, target, aligned.T_target_source, corrects))
+
+    def by_pair(part: Sequence[tuple[int, int]]) -> Iterator[Float[np.ndarray, "2 m"] | None]:
+        for ids in part:
+            target, source = map(surface_of, ids)
+            aligned = align(source, target, geometry.inverse(T_world[ids[0]]) @ T_world[ids[1]])
+            yield None if aligned is None else _of_pair(ids, source, target, aligned.T_target_source, corrects)
+
+    found = [one for one in in_parts(pairs, by_pair) if one is not None]
     if len(found) < MIN_PAIRS:
         return None
     gradients, curvatures = np.array(found).transpose(1, 0, 2)

@@ -6,7 +6,7 @@ result shows the angle better, and another round corrects the scans by it.
 """
 
 import logging
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import takewhile
@@ -17,8 +17,9 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import Config, RefineConfig
+from segslam.core.processes import in_parts
 from segslam.core.trajectory import Poses
-from segslam.core.types import GraphEstimate, IndexPairs, Record
+from segslam.core.types import GraphEstimate, Record
 from segslam.graph import Edge, PoseGraph
 from segslam.registration.refinement import INFORMATION_SCALE, limited_information
 from segslam.slam.adjustment.alignment import PointsOf
@@ -217,8 +218,12 @@ def _rounds(
         surface_of = surfaces_of(corrected_by(corrections, points_of), T_world, motion_variance, config=refine)
         aligned = of_drives or aligned_by(surface_of)
         pairs = all_pairs(T_world, travel_m, graph.covariances, min_travel_m=config.proximity.min_travel_m)
-        in_time = takewhile(lambda _: monotonic() < end_s, register_pairs(pairs, aligned, T_world, config=refine))
-        tried = list(progress(in_time, len(pairs), f"refine {number}/{config.adjustment.rounds}"))
+        title = f"refine {number}/{config.adjustment.rounds}"
+        in_time = partial(_registered_until, end_s, aligned=aligned, T_world=T_world, config=refine)
+        if known:  # which keeps alignments in the memory of this process
+            tried = list(progress(in_time(pairs.tolist()), len(pairs), title))
+        else:
+            tried = list(in_parts(pairs.tolist(), in_time, progress=progress, title=title))
         registered = [one for one in tried if one is not None]
         if not registered:
             break
@@ -229,14 +234,19 @@ def _rounds(
     return last
 
 
+def _registered_until(end_s: float, pairs: Sequence[Sequence[int]], **more: Any) -> Iterator[Edge | None]:
+    """As `register_pairs`, until a time of time.monotonic."""
+    return takewhile(lambda _: monotonic() < end_s, register_pairs(pairs, **more))
+
+
 def register_pairs(
-    pairs: IndexPairs, aligned: Aligned, T_world: Poses, *, config: RefineConfig
+    pairs: Sequence[Sequence[int]], aligned: Aligned, T_world: Poses, *, config: RefineConfig
 ) -> Iterator[Edge | None]:
     """Register each pair (target, source) from its current pose; None without convergence or enough overlap.
 
     An edge has a share of its information, so that every scan counts once.
     """
-    for target_id, source_id in pairs.tolist():
+    for target_id, source_id in pairs:
         T_prior = geometry.inverse(T_world[target_id]) @ T_world[source_id]
         found = aligned(target_id, source_id, T_prior)
         if found is None or found.overlap < MIN_OVERLAP:

@@ -12,6 +12,7 @@ from scipy.stats import wilcoxon
 
 from segslam.core import geometry
 from segslam.core.points import cell_keys, within_range
+from segslam.core.processes import in_parts
 from segslam.core.trajectory import Poses
 from segslam.core.types import IndexPairs, Indices, Points, Transform, Vector
 from segslam.odometry.checked import SIGNIFICANT
@@ -36,10 +37,15 @@ def map_thickness_m(points_of: Callable[[int], Points], T_world: Poses, pairs: I
     `pairs` (k, 2): keyframes that see the same surfaces, of which at most `MOST_PAIRS` are used.
     """
     chosen = pairs[np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), MOST_PAIRS)).astype(int))]
-    return [
-        patch_thickness_m(points_of(int(a)), points_of(int(b)), geometry.inverse(T_world[a]) @ T_world[b])
-        for a, b in chosen
-    ]
+    return list(
+        in_parts(
+            chosen.tolist(),
+            lambda part: [
+                patch_thickness_m(points_of(a), points_of(b), geometry.inverse(T_world[a]) @ T_world[b])
+                for a, b in part
+            ],
+        )
+    )
 
 
 def median_m(thickness_m: Sequence[Vector]) -> float | None:

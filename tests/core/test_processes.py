@@ -1,0 +1,95 @@
+import os
+import sys
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+
+import pytest
+
+from segslam.core import memory
+from segslam.core.memory import peak_mb
+from segslam.core.processes import in_parts
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="one process elsewhere")
+ME = os.getpid()
+
+
+@pytest.fixture(autouse=True)
+def _three_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2})
+    monkeypatch.setattr(threading, "active_count", lambda: 1)  # those of pytest do not matter here
+
+
+def squares(part: Sequence[int]) -> Iterator[tuple[int, int]]:
+    return ((number**2, os.getpid()) for number in part)
+
+
+def test_results_are_in_order_and_each_part_has_its_process() -> None:
+    done = list(in_parts(range(8), squares))
+    assert [number for number, _ in done] == [number**2 for number in range(8)]
+    pids = [pid for _, pid in done]
+    assert pids[:3] == [ME] * 3
+    assert len(set(pids)) == 3
+    assert list(in_parts([], squares)) == []
+    assert list(in_parts([7], squares)) == [(49, ME)]
+
+
+def test_all_is_done_here_while_other_threads_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threading, "active_count", lambda: 2)
+    assert {pid for _, pid in in_parts(range(8), squares)} == {ME}
+
+
+def test_what_a_copy_does_not_finish_is_done_here() -> None:
+    def ends(part: Sequence[int]) -> list[int]:
+        if os.getpid() != ME and 7 in part:
+            os._exit(3)
+        return list(part)
+
+    assert list(in_parts(range(8), ends)) == list(range(8))
+
+    def fails(part: Sequence[int]) -> list[int]:
+        if 7 in part:
+            raise ValueError("seven")
+        return list(part)
+
+    with pytest.raises(ValueError, match="seven"):
+        list(in_parts(range(8), fails))
+
+
+def test_no_process_is_left_when_the_work_is_given_up() -> None:
+    for _ in in_parts(range(8), lambda part: squares(list(part) * 10_000)):
+        break
+    with pytest.raises(ChildProcessError):
+        os.waitpid(-1, os.WNOHANG)
+
+
+def test_only_the_part_that_is_done_here_is_shown() -> None:
+    seen: list[tuple[str, int]] = []
+
+    def progress(done: Iterable[tuple[int, int]], total: int, title: str) -> Iterator[tuple[int, int]]:
+        for one in done:
+            seen.append((title, total))
+            yield one
+
+    assert len(list(in_parts(range(8), squares, progress=progress, title="squares"))) == 8
+    assert seen == [("squares", 3)] * 3
+
+
+def test_memory_of_the_copies_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "_together_mb", 0.0)
+    alone_mb = peak_mb()
+
+    def large(part: Sequence[int]) -> list[int]:
+        kept = bytearray(40 * 2**20) if os.getpid() != ME else b""
+        return [len(kept)]
+
+    assert len(list(in_parts(range(3), large))) == 3
+    assert 80.0 < peak_mb() - alone_mb < 160.0
+
+
+def test_a_copy_is_not_ended_by_ctrl_c() -> None:
+    def interrupted(part: Sequence[int]) -> list[int]:
+        if os.getpid() != ME:
+            os.kill(os.getpid(), 2)
+        return [os.getpid()]
+
+    assert len(set(in_parts(range(3), interrupted))) == 3

@@ -62,17 +62,18 @@ class _Copy:
         """Peak of the memory that the copy needed beside that of this process, known with its results."""
         self._do = lambda: work(part)
         self._pipe, theirs = Pipe(duplex=False)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # of Python 3.12, for threads of libraries
-            self._pid = os.fork()
-        if self._pid == 0:
-            self._serve(theirs)
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is for this process, which ends all
+        try:
+            self._pid = _fork()
+            if self._pid == 0:
+                self._serve(theirs)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
 
     def _serve(self, pipe: Connection) -> None:
         """Send the results and end; after a failure, nothing is sent."""
         try:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the other process, which then ends this one
             pipe.send((list(self._do()), peak_of_copy_mb()))
         finally:
             os._exit(0)
@@ -88,5 +89,16 @@ class _Copy:
     def end(self) -> None:
         """End the process; results that were not received are lost."""
         self._pipe.close()
-        os.kill(self._pid, signal.SIGKILL)
-        os.waitpid(self._pid, 0)
+        if self._pid > 0:
+            os.kill(self._pid, signal.SIGKILL)
+            os.waitpid(self._pid, 0)
+
+
+def _fork() -> int:
+    """As `os.fork`, but -1 if the system has no room for another process."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of Python 3.12, for threads of libraries
+        try:
+            return os.fork()
+        except OSError:
+            return -1

@@ -80,7 +80,7 @@ def make_fixes(source: Path | str, rows: Sequence[Row], *, note: str = "") -> Fi
     stamp_ns = np.array([row.stamp_ns for row in ordered], dtype=np.int64)
     reasons: list[str] = []
     last: tuple[int, list[float]] | None = None
-    for row, place in zip(ordered, places.tolist(), strict=True):
+    for row, place in zip(ordered, np.nan_to_num(places, nan=np.inf).tolist(), strict=True):  # NaN equals nothing
         is_default = row.latitude_deg == row.longitude_deg == 0.0  # off the coast of Africa: that of many receivers
         if not row.has_fix or is_default:
             reasons.append(NO_FIX)

@@ -1,4 +1,5 @@
 import os
+import signal
 import sys
 import threading
 from collections.abc import Iterable, Iterator, Sequence
@@ -55,6 +56,14 @@ def test_what_a_copy_does_not_finish_is_done_here() -> None:
         list(in_parts(range(8), fails))
 
 
+def test_without_room_for_a_copy_all_is_done_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full() -> int:
+        raise BlockingIOError("no more processes")
+
+    monkeypatch.setattr(os, "fork", full)
+    assert {pid for _, pid in in_parts(range(8), squares)} == {ME}
+
+
 def test_no_process_is_left_when_the_work_is_given_up() -> None:
     for _ in in_parts(range(8), lambda part: squares(list(part) * 10_000)):
         break
@@ -89,7 +98,7 @@ def test_memory_of_the_copies_counts(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_copy_is_not_ended_by_ctrl_c() -> None:
     def interrupted(part: Sequence[int]) -> list[int]:
         if os.getpid() != ME:
-            os.kill(os.getpid(), 2)
+            os.kill(os.getpid(), signal.SIGINT)
         return [os.getpid()]
 
     assert len(set(in_parts(range(3), interrupted))) == 3

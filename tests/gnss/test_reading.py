@@ -201,10 +201,10 @@ def test_midnight_is_passed(tmp_path: Path) -> None:
 
 def test_fixes_without_position_are_not_used(tmp_path: Path) -> None:
     rows = ["time,lat,lon,alt,quality", "1,48,8,100,1", "2,nan,8,100,1", "3,48.1,8,100,0", "4,48,8,100,1", "5,0,0,0,1"]
-    rows += ["6,48.2,8,,1", "6,48.3,8,,1"]
+    rows += ["6,48.2,8,,1", "6,48.3,8,,1", "7,48.3,8,,1", "8,48.3,8,,1"]
     (tmp_path / "a.csv").write_text("\n".join(rows))
     fixes = read_fixes(tmp_path / "a.csv")
-    assert fixes.reasons == ("", "not_finite", "no_fix", "duplicate", "no_fix", "", "duplicate")
+    assert fixes.reasons == ("", "not_finite", "no_fix", "duplicate", "no_fix", "", "duplicate", "", "duplicate")
     (tmp_path / "none.csv").write_text("\n".join([rows[0], rows[2], rows[3]]))
     with pytest.raises(SegslamError, match="none of its 2 fixes can be used"):
         read_fixes(tmp_path / "none.csv")

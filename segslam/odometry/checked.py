@@ -38,7 +38,8 @@ SIGNIFICANT = 0.001
 """Chosen: an odometry of other sensors is overruled where its pose is less likely than this, given the scans, and less
 likely motions are not considered; KISS-ICP is off where chance explains its distance from a registration with less;
 and a pose has a good score if its odds of being wrong are less.
-The adjustment has the same share of chance for a sweep that scans show, and for a pose out of reach of an alignment."""
+The adjustment has the same share of chance for a sweep that scans show, for surfaces that become thicker, and for a
+pose out of reach of an alignment."""
 MOST_OFF = float(chi2.isf(SIGNIFICANT, 6))
 """Chi-square above which a pose of the odometry is significantly off the registered one."""
 MOST_OFF_TOGETHER = float(chi2.isf(SIGNIFICANT, 6 * WINDOW))

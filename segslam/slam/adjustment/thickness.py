@@ -8,13 +8,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import rankdata
+from scipy.stats import wilcoxon
 
 from segslam.core import geometry
 from segslam.core.points import cell_keys, within_range
 from segslam.core.processes import in_parts
 from segslam.core.trajectory import Poses
 from segslam.core.types import IndexPairs, Indices, Points, Transform, Vector
+from segslam.odometry.checked import SIGNIFICANT
 
 CELL_M = 1.0
 """Chosen: edge of the cells that hold a patch; walls and roads are flat over it."""
@@ -54,14 +55,16 @@ def median_m(thickness_m: Sequence[Vector]) -> float | None:
 
 
 def is_thicker(before_m: Sequence[Vector], after_m: Sequence[Vector]) -> bool:
-    """True if the same pairs of scans show rather thicker than thinner surfaces afterwards (signed ranks, Wilcoxon)."""
+    """True if the same pairs of scans show significantly thicker surfaces afterwards (signed ranks of Wilcoxon)."""
     medians = [
         (np.median(before), np.median(after))
         for before, after in zip(before_m, after_m, strict=True)
         if len(before) and len(after)
     ]
-    change = np.array([after - before for before, after in medians])
-    return bool(np.sign(change) @ rankdata(np.abs(change)) > 0.0)
+    if len(medians) == 0:
+        return False
+    change = np.subtract(*np.transpose(medians)[::-1])
+    return bool(change.any() and wilcoxon(change, alternative="greater").pvalue < SIGNIFICANT)
 
 
 def patch_thickness_m(points_a: Points, points_b: Points, T_a_b: Transform) -> Vector:

@@ -198,7 +198,6 @@ class Run:
                 why = f"none of {len(self._unreported)} scans could be used; the first: {self._unreported[0]}"
             raise SegslamError(f"{self._dataset}: {why}")
         started = perf_counter()
-        give_back()  # the adjustment needs most
         result = self._slam.finish(search_s=search_s, progress=progress)
         self._note_ms("finish", perf_counter() - started)
         if result.adjusted is None:

@@ -1,7 +1,7 @@
 """Loop closing: candidates for each keyframe are registered and verified; a second search uses the final poses."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import lru_cache
 from time import monotonic
 
@@ -14,12 +14,12 @@ from segslam.graph import Graph
 from segslam.graph.chains import far_from_prior, prior_gate
 from segslam.graph.confirmation import Confirmation
 from segslam.keyframes import Submaps
-from segslam.registration.prepared import Labeller, PreparedScan
+from segslam.registration.prepared import Labeller
 from segslam.slam.far_loops import FarLoops
 from segslam.slam.loop_edits import LoopEdits
 from segslam.verification import register_near, register_prepared
 from segslam.verification.score import MISLED
-from segslam.verification.trial import anywhere
+from segslam.verification.trial import anywhere, forget_scans
 
 NUM_PREPARED = 64
 """Number of prepared keyframes in memory, about 2 MB each; preparing another takes about 40 ms."""
@@ -54,7 +54,7 @@ class LoopCloser:
         self._graph = graph
         self.detector = ProximityDetector(config.proximity)
         self.submaps = Submaps(config, clouds, labeller, lambda: graph.motion_variance)
-        self._prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
+        self._prepared = lru_cache(NUM_PREPARED)(self.submaps.prepared)
         self._confirmation = Confirmation(graph)
         self._far = FarLoops(config, graph, self._prepared, self._confirmation, edits.forbidden)
         self._tried: set[tuple[int, int]] = set(edits.forbidden)
@@ -76,6 +76,11 @@ class LoopCloser:
         signature = self.submaps.signature(newest_id, recorded)
         self._far.add(newest_id, signature)
         return signature
+
+    def forget(self) -> None:
+        """Release the prepared keyframes; they are prepared again when they are needed."""
+        self._prepared.cache_clear()
+        forget_scans()
 
     def attempt(self, keyframe_id: int, watch: Stopwatch, *, below: int | None = None) -> tuple[LoopAttempt, ...]:
         """Propose and try loops for a keyframe; with `below`, only with smaller ids, those of earlier sessions."""

@@ -11,6 +11,7 @@ from time import monotonic
 import numpy as np
 
 from segslam.core.config import Config
+from segslam.core.memory import give_back
 from segslam.core.threads import Stopwatch
 from segslam.core.trajectory import corrected_poses
 from segslam.core.types import (
@@ -154,6 +155,8 @@ class Slam:
             raise ValueError("no scan was processed")
         self._is_finished = True
         estimate, late = self._settle(monotonic() + search_s)
+        self._loops.forget()
+        give_back()  # the adjustment needs most
         odometry = self._odometry()
         rows = np.array(self._keyframe_rows)
         adjusted = None

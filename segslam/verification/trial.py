@@ -82,6 +82,12 @@ def few_points(source: PreparedScan, config: RefineConfig) -> refinement.Surface
     return refinement.sparse(source.surface, config=config)
 
 
+def forget_scans() -> None:
+    """Release what was computed from the last scans; it is computed again when it is needed."""
+    for kept in (_ranked_plans, _floor_plan, few_points, patches.patches_of):
+        kept.cache_clear()
+
+
 class Found(NamedTuple):
     """A refined pose, and what the scans show there."""
 

@@ -86,9 +86,8 @@ def test_an_adjustment_after_which_surfaces_are_thicker_is_dropped(
     assert "surfaces of the map were thinner before the adjustment" in caplog.text
 
 
-@pytest.mark.parametrize("cores", [1, 3])
-def test_the_adjustment_is_the_same_on_any_number_of_cores(cores: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+def test_the_adjustment_is_the_same_on_any_number_of_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2})
     monkeypatch.setattr(threading, "active_count", lambda: 1)  # those of pytest do not matter here
     again = graph()
     adjust(again, again.finish(), points, STILL, config=CONFIG)

@@ -7,7 +7,6 @@ translation] with the perturbation on the right.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -60,7 +59,7 @@ UNOBSERVED = 0.01
 """Chosen: a ratio of variances below this means unobserved; a smooth tunnel has 0.001, from GICP's tangents."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Surface:
     """A scan prepared for GICP: downsampled points with covariances, and their search tree."""
 
@@ -70,12 +69,12 @@ class Surface:
     """Root mean square distance of standing points to the plane through the nearest other point: the residual due to
     noise and shape within one scan at this voxel size."""
 
-    @cached_property  # `cloud` copies them
+    @property
     def points(self) -> Points:
         """(n, 3), in the scan's frame."""
         return self.cloud.points()[:, :3]
 
-    @cached_property
+    @property
     def normals(self) -> Points:
         """(n, 3), of unit length."""
         return self.cloud.normals()[:, :3]

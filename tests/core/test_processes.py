@@ -64,11 +64,21 @@ def test_without_room_for_a_copy_all_is_done_here(monkeypatch: pytest.MonkeyPatc
     assert {pid for _, pid in in_parts(range(8), squares)} == {ME}
 
 
-def test_no_process_is_left_when_the_work_is_given_up() -> None:
+def test_no_process_is_left_when_the_work_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[int] = []
+    fork = os.fork
+
+    def noted() -> int:
+        begun.append(fork())
+        return begun[-1]
+
+    monkeypatch.setattr(os, "fork", noted)
     for _ in in_parts(range(8), lambda part: squares(list(part) * 10_000)):
         break
-    with pytest.raises(ChildProcessError):
-        os.waitpid(-1, os.WNOHANG)
+    assert len(begun) == 2
+    for pid in begun:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
 
 
 def test_only_the_part_that_is_done_here_is_shown() -> None:

@@ -20,7 +20,7 @@ from segslam.core.memory import note_peak_with, peak_of_copy_mb
 Item = TypeVar("Item")
 Done = TypeVar("Done")
 MOST = 8
-"""Chosen: number of processes that share work; each other one takes up to 110 MB (KITTI 00 whole)."""
+"""Chosen: number of processes that share work; each other one takes some 110 MB (KITTI 00 whole)."""
 
 
 def in_parts(
@@ -37,8 +37,10 @@ def in_parts(
     done here where there is one core, and while other threads run: a copy would wait forever for a lock that they hold.
     """
     first, *others = np.array_split(np.arange(len(items)), max(1, min(_num_processes(), len(items))))
-    copies = [_Copy(work, [items[row] for row in rows]) for rows in others]
+    copies: list[_Copy] = []
     try:
+        for rows in others:
+            copies.append(_Copy(work, [items[row] for row in rows]))
         yield from progress(work([items[row] for row in first]), len(first), title)
         for copy in copies:
             yield from copy.results()

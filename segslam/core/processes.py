@@ -39,8 +39,7 @@ def in_parts(
     first, *others = np.array_split(np.arange(len(items)), max(1, min(_num_processes(), len(items))))
     copies: list[_Copy] = []
     try:
-        for rows in others:
-            copies.append(_Copy(work, [items[row] for row in rows]))
+        copies.extend(_Copy(work, [items[row] for row in rows]) for rows in others)
         yield from progress(work([items[row] for row in first]), len(first), title)
         for copy in copies:
             yield from copy.results()

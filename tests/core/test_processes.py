@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import pytest
 
-from segslam.core import memory
+from segslam.core import memory, processes
 from segslam.core.memory import peak_mb
 from segslam.core.processes import in_parts
 
@@ -64,21 +64,48 @@ def test_without_room_for_a_copy_all_is_done_here(monkeypatch: pytest.MonkeyPatc
     assert {pid for _, pid in in_parts(range(8), squares)} == {ME}
 
 
-def test_no_process_is_left_when_the_work_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    begun: list[int] = []
+@pytest.fixture
+def begun(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The ids of all copies."""
+    pids: list[int] = []
     fork = os.fork
 
     def noted() -> int:
-        begun.append(fork())
-        return begun[-1]
+        pids.append(fork())
+        return pids[-1]
 
     monkeypatch.setattr(os, "fork", noted)
+    return pids
+
+
+def is_left(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_no_process_is_left_when_the_work_is_given_up(begun: list[int]) -> None:
     for _ in in_parts(range(8), lambda part: squares(list(part) * 10_000)):
         break
     assert len(begun) == 2
-    for pid in begun:
-        with pytest.raises(ProcessLookupError):
-            os.kill(pid, 0)
+    assert not any(map(is_left, begun))
+
+
+def test_no_process_is_left_when_another_cannot_begin(begun: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    pipe = processes.Pipe
+
+    def once(**more: bool) -> object:
+        if begun:
+            raise OSError("too many open files")
+        return pipe(**more)
+
+    monkeypatch.setattr(processes, "Pipe", once)
+    with pytest.raises(OSError, match="too many"):
+        list(in_parts(range(8), squares))
+    assert len(begun) == 1
+    assert not is_left(begun[0])
 
 
 def test_only_the_part_that_is_done_here_is_shown() -> None:

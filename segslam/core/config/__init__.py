@@ -67,10 +67,18 @@ REMOVED = {
 
 MOST_NAMED = 3
 """Number of settings that a warning names."""
+MOST_LEVELS = 100
+"""Chosen: brackets around a bracket of a YAML text. YAML's scanner looks far ahead and at all of them each time."""
 
 
 class _Loader(yaml.SafeLoader):
     """Rejects duplicate keys, of which YAML's own loader uses the last, and aliases, which multiply a short text."""
+
+    def fetch_flow_collection_start(self, token_class: Any) -> None:
+        """As in the base class. Raises ScannerError, with its line, for a bracket within too many others."""
+        if self.flow_level >= MOST_LEVELS:
+            raise yaml.scanner.ScannerError(None, None, "nested too deeply", self.get_mark())
+        super().fetch_flow_collection_start(token_class)
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """As in the base class. Raises ComposerError, with its line, for an alias."""

@@ -12,7 +12,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # as many processes as cores: their thr
     for library in ("OMP", "OPENBLAS", "NUMBA"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 
-import helpers.checker  # noqa: F401  (named below)
+import helpers.checker
 import hypothesis
 import numpy as np
 import pytest
@@ -35,6 +35,10 @@ def _modules_checked() -> list[str]:
 install_import_hook(_modules_checked(), "helpers.checker.check")
 hypothesis.settings.register_profile("steady", deadline=None)  # a slow machine is no failure
 hypothesis.settings.load_profile("steady")
+
+
+def pytest_runtest_setup() -> None:
+    helpers.checker.begin_test()
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jaxtyping import TypeCheckError
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
@@ -92,3 +93,12 @@ def test_the_angle_is_that_of_scipy(angle_rad: float) -> None:
         T = geometry.transform(rotation.as_matrix(), 0.0)
         assert geometry.angle(T) == pytest.approx(angle_rad, abs=1e-14)
         np.testing.assert_allclose(geometry.exp(np.r_[angle_rad * axis / np.linalg.norm(axis), 0, 0, 0]), T, atol=1e-14)
+
+
+def test_shapes_are_checked_in_tests() -> None:
+    """In the first calls of each test: see `helpers.checker`."""
+    points = np.zeros((3, 3))
+    for _ in range(4):
+        geometry.apply(np.eye(4), points)
+    with pytest.raises(TypeCheckError):
+        geometry.apply(np.eye(3), points)

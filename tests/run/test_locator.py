@@ -108,12 +108,10 @@ def test_the_command_prints_a_pose_a_scan_and_fails_where_it_finds_none(
     assert lost["T_world_lidar"] is None
     assert lost["reason"]
     np.save(nothing, np.ones((30, 3)))  # so few are refused at once
-    assert commands.run("locate", run, nothing) == 1
+    assert commands.run("locate", run / "log.mcap", nothing) == 1
     out, err = capsys.readouterr()
     assert out == ""
     assert "b.npy: not found: " in err
-    assert commands.run("locate", run / "log.mcap", scan) == 0
-    assert len(capsys.readouterr().out.split()) == 17
 
 
 def test_poses_are_printed_though_another_scan_is_unreadable(
@@ -125,6 +123,7 @@ def test_poses_are_printed_though_another_scan_is_unreadable(
     assert commands.run("locate", run, bad, scan, "--quiet") == 2
     out, err = capsys.readouterr()
     assert out.startswith(f"{scan} ")
+    assert len(out.split()) == 17
     assert "b.bin: not found: unreadable" in err
     assert "1 of 2 scans cannot be read" in err
     assert "--frames" not in err

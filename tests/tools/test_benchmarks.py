@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,8 @@ from segslam.bench.simulation.tracks import example_drive
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.trajectory import camera_from_lidar, write_kitti
+from segslam.output.finished import read_run
+from segslam.slam.slam_result import SlamResult
 from tools.benchmarks import (
     common,
     label_maps,
@@ -28,6 +30,7 @@ from tools.benchmarks import (
     locate,
     odometry,
     peers,
+    real,
     real_pairs,
     recognition,
     scenes,
@@ -139,6 +142,22 @@ def test_sequences_shows_a_run_without_closures() -> None:
     row = {"run": "a/run", "odometry": errors, "found": errors, "exact": errors, "exact_everywhere": errors}
     row |= {"loops": {"closures": 0}, "noise": {"chain_1": 1.0, "chain_10": None, "chain_100": None, "closures": None}}
     assert sequences.cells(row | {"ate_by_exact": 1.0})["closures, false, off"] == "0, 0, 0"
+
+
+def test_real_shows_where_true_poses_contradict_the_scans(mapped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The scans of a run with true poses as odometry agree with them; then later true heights are wrong by 0.3 m."""
+    made = read_run(mapped)
+    assert made.reference is not None
+    monkeypatch.setattr(
+        SlamResult, "closures", lambda _: [SimpleNamespace(target_id=n, source_id=n + 8) for n in (0, 1)]
+    )
+    right = real.thickness_at_loops(made)
+    assert right["thickness_at_loops_m"] < right["thickness_at_loops_true_m"] < 0.02
+    T_wrong = made.reference.T_world_lidar.copy()
+    T_wrong[5:, 2, 3] += 0.3
+    wrong = real.thickness_at_loops(replace(made, reference=replace(made.reference, T_world_lidar=T_wrong)))
+    assert wrong["thickness_at_loops_m"] == right["thickness_at_loops_m"]
+    assert wrong["thickness_at_loops_true_m"] > 0.04
 
 
 def test_peers_reads_the_poses_and_closures_of_the_other_program(call: Call, tmp_path: Path) -> None:

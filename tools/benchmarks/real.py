@@ -4,7 +4,8 @@
 
 Runs of `segslam map` with default settings, several of one drive separated by commas: medians over them. KISS-ICP alone
 is that of the first run. The covariances of its motions are compared with their errors: the share within the ellipsoid
-of 99 %, and the median of chi-square divided by the expected one.
+of 99 %, and the median of chi-square divided by the expected one. Surfaces that both keyframes of a loop see are thin
+where the poses are right: their thickness by the poses of the run, and by the true poses, shows how true these are.
 """
 
 import json
@@ -23,6 +24,7 @@ from segslam.core.types import Points, Trajectory
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import LOG
 from segslam.output.log import read_log
+from segslam.slam.adjustment.thickness import map_thickness_m, median_m
 from tools.benchmarks import common
 
 EXACT = ("num_loops_accepted", "num_loops_false", "num_motions_repaired", "num_motions_broken")
@@ -47,7 +49,7 @@ def row(name: str, runs: list[FinishedRun]) -> common.Row:
         values = [run.metrics[key] for run in runs if key in run.metrics]
         if values:
             found[key] = round(median(values), 4 if key in METRES else 3)
-    found |= within_covariance(first)
+    found |= within_covariance(first) | thickness_at_loops(first)
     for key in ("odometry_ate_m", "ate_m"):
         found[f"{key}_all"] = sorted(round(run.metrics[key], 3) for run in runs)
     return found
@@ -72,6 +74,28 @@ def within_covariance(run: FinishedRun) -> common.Row:
         "motions_within_99_percent": round(float(np.mean(np.array(squares) < chi2.ppf(0.99, 6))), 3),
         "chi_square_of_motions": round(float(np.median(squares) / chi2.median(6)), 2),
     }
+
+
+def thickness_at_loops(run: FinishedRun) -> common.Row:
+    """Median thickness of the surfaces that both keyframes of a loop see (m), by the poses of the run and true ones.
+
+    Of the clouds as they are. Empty if there are too few such surfaces.
+    """
+    assert run.reference is not None
+    numbers = run.result.keyframe_rows
+    rows = rows_of_same_scan(run.result.trajectory.scan_index[numbers], run.reference.scan_index)
+    T_true = np.full((len(numbers), 4, 4), np.nan)
+    T_true[rows[:, 0]] = run.reference.T_world_lidar[rows[:, 1]]
+    loops = np.array([(one.target_id, one.source_id) for one in run.result.closures()], np.int64).reshape(-1, 2)
+    loops = loops[np.isfinite(T_true[loops]).all(axis=(1, 2, 3))]
+    keyframes = (step.keyframe for step in read_log(run.folder / LOG).steps())
+    points = {one.id: one.points for one in keyframes if one is not None and one.id in loops}
+    found = {}
+    for name, T_world in (("", run.result.trajectory.T_world_lidar[numbers]), ("_true", T_true)):
+        thickness_m = median_m(map_thickness_m(points.__getitem__, T_world, loops))
+        if thickness_m is not None:
+            found[f"thickness_at_loops{name}_m"] = round(thickness_m, 4)
+    return found
 
 
 def draw(run: FinishedRun, alone: Trajectory, file: Path) -> None:

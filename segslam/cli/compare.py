@@ -10,7 +10,7 @@ import typer
 
 from segslam.cli import completion
 from segslam.cli.checks import check_exists, check_free, check_own, check_run
-from segslam.cli.console import Terminal, print_json
+from segslam.cli.console import Terminal
 from segslam.cli.options import OverwriteOption
 from segslam.cli.tables import TableFiles, as_text, with_meanings
 from segslam.core.errors import SegslamError, WorkFailed
@@ -47,13 +47,11 @@ def compare(
         draw_runs(plot, {name: read_run(folder) for name, folder in zip(names, runs, strict=True)})
     figures = {name: read_metrics(folder) for name, folder in zip(names, runs, strict=True)}
     tables.write(figures)
-    if terminal.json:
-        print_json({"runs": figures, "plot": None if plot is None else str(plot)})
-        return
     width = max(14, *(len(name) + 2 for name in figures))
-    print("".join(f"{name:>{width}}" for name in figures))
-    print(with_meanings(list(figures.values()), FIGURES, width=width), flush=True)
-    if plot is not None:
+    names_line = "".join(f"{name:>{width}}" for name in figures)
+    text = f"{names_line}\n{with_meanings(list(figures.values()), FIGURES, width=width)}"
+    terminal.table({"runs": figures, "plot": None if plot is None else str(plot)}, text)
+    if plot is not None and not terminal.json:
         terminal.say(f"figure written to {plot}")
 
 

@@ -32,7 +32,7 @@ def test_a_forbidden_loop_is_not_closed_by_this_replay_and_later_ones(log: Path,
     assert (newer, older) in _closures(tmp_path / "back" / "log.mcap")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_refined_run_keeps_the_edits_for_later_replays(log: Path, tmp_path: Path) -> None:
     newer, older = max(_closures(log))
     assert run("edit", log, "--forbid", f"{newer}:{older}", "--out", tmp_path / "edited", *QUICK) == 0

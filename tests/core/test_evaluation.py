@@ -27,8 +27,8 @@ from segslam.core.trajectory import read_poses
 
 REAL = [  # camera frame or ground-truth frame: each is scored against the official poses as it is
     ("KITTI_00_ORB", "00", 1.30),
-    pytest.param("KITTI_00_SPTAM", "00", 3.74, marks=pytest.mark.slow),
-    pytest.param("simple_online_00", "00", 4.86, marks=pytest.mark.slow),
+    pytest.param("KITTI_00_SPTAM", "00", 3.74, marks=pytest.mark.long),
+    pytest.param("simple_online_00", "00", 4.86, marks=pytest.mark.long),
     ("simple_online_05", "05", 2.29),
     ("simple_online_07", "07", 0.78),
 ]

@@ -98,7 +98,6 @@ def test_the_angle_is_that_of_scipy(angle_rad: float) -> None:
 def test_shapes_are_checked_in_tests() -> None:
     """In the first calls of each test: see `helpers.checker`."""
     points = np.zeros((3, 3))
-    for _ in range(4):
-        geometry.apply(np.eye(4), points)
+    geometry.apply(np.eye(4), points)
     with pytest.raises(TypeCheckError):
         geometry.apply(np.eye(3), points)

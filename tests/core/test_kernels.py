@@ -21,7 +21,7 @@ def test_every_module_with_kernels_is_built() -> None:
     assert _names(others) == {"core.kernels"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_build_compiles_all_kernels_once_and_is_remembered(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     modules = ["registration.cliques"]

@@ -26,7 +26,7 @@ def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
     return made
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_damaged_file_does_more_than_fail(readers: dict[str, Target]) -> None:
     for name, target in readers.items():
         found = defects(target.read, target.file, contents(target, 0, NUM_INPUTS))

@@ -19,7 +19,7 @@ from segslam.odometry.kiss import KissOdometry
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import register, register_prepared
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 CONFIG = Config()
 CHI2_95 = 12.592
 """0.95 quantile of chi-square with 6 degrees of freedom."""

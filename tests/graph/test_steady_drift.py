@@ -62,7 +62,7 @@ def _ate_m(poses: np.ndarray, truth: np.ndarray) -> float:
     return float(np.sqrt(((poses[:, :3, 3] - truth[:, :3, 3]) ** 2).sum(axis=1).mean()))
 
 
-@pytest.mark.parametrize(("rad_per_m", "rad_per_s"), [pytest.param(8e-4, 0.0, marks=pytest.mark.slow), (0.0, 6e-3)])
+@pytest.mark.parametrize(("rad_per_m", "rad_per_s"), [pytest.param(8e-4, 0.0, marks=pytest.mark.long), (0.0, 6e-3)])
 def test_a_large_steady_drift_leaves_hardly_more_error_than_a_small_one(rad_per_m: float, rad_per_s: float) -> None:
     _, small, _ = mapped_ate_m(rad_per_m / 100, rad_per_s / 100)
     odometry, large, graph = mapped_ate_m(rad_per_m, rad_per_s)

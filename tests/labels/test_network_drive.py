@@ -121,7 +121,7 @@ def test_a_resumed_run_labels_the_keyframes_that_its_log_has_not(
     assert counts["scans"] == labelled_run.metrics["num_keyframes"] - logged
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_network_that_knows_the_classes_closes_loops_as_true_labels_do(
     labelled_run: Mapped, true_run: Mapped
 ) -> None:

@@ -200,7 +200,7 @@ def test_results_without_disk_space_end_with_status_2_and_the_run_is_resumed(
     _resumed_as_whole(kitti, whole, out)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_killed_before_its_report_gets_it_on_resuming(kitti: Path, whole: Path, tmp_path: Path) -> None:
     shutil.copytree(whole, tmp_path / "run")
     (tmp_path / "run" / "report.html").unlink()

@@ -101,7 +101,7 @@ def test_one_keyframe_alone_closes_no_far_loop() -> None:
     assert len(unconfirmed) >= 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_drive_whose_odometry_is_good_closes_by_proximity_as_before() -> None:
     before, after = mapped(0.15, "retrieval.enabled=false"), mapped(0.15)
     pairs = [[(closure.source_id, closure.target_id) for closure in run.closures()] for run in (before, after)]

@@ -66,7 +66,7 @@ def test_submaps_straighten_a_bent_drive_and_its_surfaces_become_thinner() -> No
     np.testing.assert_array_equal(found.after.T_world_keyframe[NUM - 1], made.T_world_keyframes[-1])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_low_beams_are_measured_and_do_not_bend_the_drive() -> None:
     made = graph(pitch_deg=0.0)
     found = adjust(made, made.finish(), lambda keyframe_id: points(keyframe_id, 0.2), STILL, config=CONFIG)

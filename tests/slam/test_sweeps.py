@@ -51,7 +51,7 @@ def measured(seconds: float, from_deg: float = 180.0, velocities: Velocities | N
     )
 
 
-@pytest.mark.parametrize(("seconds", "from_deg"), [(-0.1, 180.0), pytest.param(0.05, 90.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("seconds", "from_deg"), [(-0.1, 180.0), pytest.param(0.05, 90.0, marks=pytest.mark.long)])
 def test_the_duration_and_the_side_of_a_sweep_are_measured(seconds: float, from_deg: float) -> None:
     found = measured(seconds, from_deg)
     assert found is not None

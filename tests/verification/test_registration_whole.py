@@ -43,7 +43,7 @@ def _digest(scans: Path, num_threads: int) -> str:
     return done.stdout.strip()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_thread_and_two_give_the_same_bits(tmp_path: Path) -> None:
     scans, _ = round_drive()
     arrays = {f"{name}{k}": getattr(scans[i], name) for k, i in enumerate((3, 0)) for name in ("points", "labels")}

@@ -55,7 +55,7 @@ def finish(
     metrics, placed = run.complete(
         more=more, place=place, map_files=map_files, search_s=search_s, progress=terminal.progress
     )
-    written = map_summary(metrics, map_files) if map_files else ""
+    written = map_summary(metrics, map_files) if "map_seconds" in metrics else ""
     texts = (summary(metrics, run.folder), vertical_angle_advice(metrics, run.config.sensor), placed, written)
     terminal.answer(metrics, "\n".join(filter(None, texts)))
     return metrics

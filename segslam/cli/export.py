@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from segslam.cli.checks import check_exists, check_free
+from segslam.cli.checks import check_exists, check_free, check_links
 from segslam.cli.console import Terminal
 from segslam.cli.ending import map_summary
 from segslam.cli.options import GnssOptions, OverwriteOption, Settings
@@ -106,6 +106,7 @@ def georeference(
     from segslam.output.report import write_report
 
     folder = folder_of(run)
+    check_links(folder)
     data = read_log(folder).options.get("data")  # may have a topic with fixes
     place = gnss.placing(Path(data) if data else None)
     if place is None:

@@ -44,9 +44,6 @@ class KissOdometry:
         self._T_odom_last = T_odom_lidar
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
 
-    def foresee(self, scan: Scan, *, gap: float) -> None:
-        """Nothing begins: this process is busy with the check of the scan before."""
-
     def _aligned(self, scan: Scan, gap: float) -> tuple[Swept, Transform]:
         """The points of the next scan, and its pose."""
         swept = deskew_scan(scan, self._T_last_lidar, self._config)

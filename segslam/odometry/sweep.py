@@ -49,10 +49,6 @@ class Odometry(Protocol):
         """
         ...
 
-    def foresee(self, scan: Scan, *, gap: float) -> None:
-        """The scan to be registered next, with this `gap`, is known: work on it may begin while this one is checked."""
-        ...
-
     def follow(
         self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
     ) -> None:
@@ -60,6 +56,15 @@ class Odometry(Protocol):
 
         `T_before_lidar`: the motion between the last two scans, per interval of the sensor.
         """
+        ...
+
+
+@runtime_checkable
+class Foreseeing(Protocol):
+    """An odometry that works on the next scan while the present one is checked."""
+
+    def foresee(self, scan: Scan, *, gap: float) -> None:
+        """Begin to register the next scan, `gap` intervals after this one, as if the pose of this one stays."""
         ...
 
 
@@ -126,9 +131,6 @@ class GivenOdometry:
         )
         self._T_odom_given, self._T_odom_last, self._T_given_last = T_odom_given, T_odom_lidar, T_given_lidar
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
-
-    def foresee(self, scan: Scan, *, gap: float) -> None:
-        """There is no work to begin."""
 
     def follow(
         self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform

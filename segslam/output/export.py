@@ -13,7 +13,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from segslam.core.config import MapConfig, load_config
-from segslam.core.types import GraphEstimate, Indices, Keyframe, SegslamError, Trajectory, Transform
+from segslam.core.types import GraphEstimate, Indices, Keyframe, Mask, SegslamError, Trajectory, Transform
 from segslam.core.whole_files import cannot_write, whole_file
 from segslam.output.finished import read_corrections
 from segslam.output.folder import PLACE_ON_GLOBE, read_localised
@@ -72,7 +72,9 @@ def write_maps(
             if file.name == BEFORE_AFTER:
                 complete.enter_context(whole_file(file)).write_bytes(draw_before_after(folder))
             elif is_track(file):
-                content = track(file, *_localised(log, globe), name=folder.resolve().name)
+                rows, stamp_ns = np.flatnonzero(_in_map(log)), _finished(log)[1].stamp_ns
+                there = globe and replace(globe, T_enu_lidar=globe.T_enu_lidar[rows])
+                content = track(file, there, stamp_ns[rows], name=folder.resolve().name)
                 complete.enter_context(whole_file(file)).write_bytes(content)
         if not of_map:
             return {"map_seconds": perf_counter() - started}
@@ -93,13 +95,16 @@ def _finished(log: RunLog) -> tuple[GraphEstimate, Trajectory]:
 
 
 def _placed(log: RunLog, globe: "Globe | None", show: Progress) -> Iterator[tuple[Keyframe, Transform]]:
-    """Each keyframe, its points corrected as in the adjustment, with its final pose in the world, or on the globe."""
+    """Each keyframe of known pose, in the world or on the globe, its points corrected as in the adjustment."""
     estimate, _ = _finished(log)
+    in_map = _in_map(log)
     corrections = read_corrections(log, len(estimate.T_world_keyframe))
     num_gathered = 0
     for row, step in enumerate(show(log.steps(), log.num_steps(), "gather")):
-        if step.keyframe is not None:
-            num_gathered += 1
+        if step.keyframe is None:
+            continue
+        num_gathered += 1
+        if in_map[row]:
             points = corrections[step.keyframe.id](step.keyframe.points)
             T_world_keyframe = estimate.T_world_keyframe[step.keyframe.id] if globe is None else globe.T_enu_lidar[row]
             yield replace(step.keyframe, points=points), T_world_keyframe
@@ -108,12 +113,11 @@ def _placed(log: RunLog, globe: "Globe | None", show: Progress) -> Iterator[tupl
         raise SegslamError(f"{log.path}: damaged, {readable}; the map is not written. Map the data again, or replay it")
 
 
-def _localised(log: RunLog, globe: "Globe | None") -> "tuple[Globe | None, Indices]":
-    """The place on the globe of the scans that are in the map, and their times."""
-    trajectory = _finished(log)[1]
-    from_map_m = read_localised(log.path.parent, len(trajectory))
-    rows = np.arange(len(trajectory)) if from_map_m is None else np.flatnonzero(from_map_m <= TRUSTED_M)
-    return globe and replace(globe, T_enu_lidar=globe.T_enu_lidar[rows]), trajectory.stamp_ns[rows]
+def _in_map(log: RunLog) -> Mask:
+    """(n,) whether the pose of each scan is known: of a run localised in a map, where it is."""
+    num_scans = len(_finished(log)[1])
+    from_map_m = read_localised(log.path.parent, num_scans)
+    return np.ones(num_scans, dtype=bool) if from_map_m is None else from_map_m <= TRUSTED_M
 
 
 def is_track(file: Path) -> bool:

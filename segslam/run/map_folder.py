@@ -55,7 +55,8 @@ def map_folder(
     scans = open_scans(source, config or Config())
     config = in_effect(config or preset(preset_for(extent_m(scans))), scans.vertical_angle_deg)
     folder = new_folder(Path(out))
-    own = {"odometry": odometry, "slam_of": None if slam_of is Slam or "in_map" in options else slam_of}
+    maker = None if slam_of is Slam or "in_map" in options else slam_of
+    own = {"odometry": odometry, "slam_of": maker, "place": place}
     not_resumed = [name for name, value in own.items() if value is not None]
     recorded = {**resume_options(source), "python": ", ".join(not_resumed), **options}
     alone = KissOdometry(config.odometry, keeps_alone=True)

@@ -267,8 +267,8 @@ class Run:
 
         `more` adds figures computed from the result. `place` georeferences the folder before the maps are written, and
         returns what it found. `search_s` limits the last search for loops, and `progress` shows the adjustment, as in
-        `Slam.finish`. Raises SegslamError if there was no step. A failure of place or maps leaves a report, and one of
-        the place the maps.
+        `Slam.finish`. No map is written of a drive that was not localised anywhere. Raises SegslamError if there was no
+        step. A failure of place or maps leaves a report, and one of the place the maps.
         """
         from segslam.output.report import write_report
 
@@ -285,7 +285,7 @@ class Run:
                     metrics = read_metrics(self.folder)
                 except SegslamError as error:  # the maps do not need it
                     failure = error
-            if map_files:
+            if map_files and result.localised().any():
                 from segslam.output.export import write_maps
 
                 log = read_log(self.folder)

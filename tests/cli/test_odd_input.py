@@ -145,7 +145,7 @@ def test_a_resumed_run_writes_no_file_outside_that_its_log_names(
 
 
 @pytest.mark.parametrize("name", ["metrics.json", ".poses_tum.txt.part", "report.html"])
-@pytest.mark.parametrize("command", ["resume", "report", "eval"])
+@pytest.mark.parametrize("command", ["resume", "report", "eval", "georeference"])
 def test_a_run_with_a_link_to_outside_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, name: str
 ) -> None:

@@ -24,7 +24,7 @@ from segslam.core import geometry
 from segslam.core.types import Points, SegslamError
 from segslam.gnss import Origin, enu_from_geodetic, geodetic_from_enu
 from segslam.gnss.geodesy import utm
-from segslam.output.export import track
+from segslam.output.export import export, track
 from segslam.output.folder import write_localised
 from segslam.output.georeferenced import Globe, georeference, read_globe, take_over
 from segslam.output.log import read_log, schema
@@ -295,7 +295,7 @@ def test_fixes_that_place_nothing_leave_the_maps_and_others_place_the_run(
     assert read_globe(out) is not None
 
 
-def test_only_localised_scans_are_in_a_track(made: MadeRun, tmp_path: Path) -> None:
+def test_only_localised_scans_are_in_a_track_and_in_a_map(made: MadeRun, tmp_path: Path) -> None:
     copy = tmp_path / "run"
     shutil.copytree(made.folder, copy)
     trajectory = made.result.trajectory
@@ -303,8 +303,12 @@ def test_only_localised_scans_are_in_a_track(made: MadeRun, tmp_path: Path) -> N
     write_localised(copy, trajectory, from_map_m, from_map_m < 20.0)
     assert run("export", copy, copy / "a.gpx", "--quiet") == 0
     assert (copy / "a.gpx").read_text().count("<trkpt") == 40
+    of_all = export(made.folder, [tmp_path / "all.ply"])["num_map_points"]
+    assert 0 < export(copy, [copy / "a.ply"])["num_map_points"] < 0.8 * of_all
     write_localised(copy, trajectory, np.full(len(trajectory), np.inf), np.zeros(len(trajectory), bool))
     assert not take_over(copy, made.folder), "no scan was localised"
+    with pytest.raises(SegslamError, match="no keyframe of known pose has a static point"):
+        export(copy, [copy / "b.ply"])
 
 
 def test_a_place_is_refused_with_the_reason(made: MadeRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -96,7 +96,8 @@ def test_text_of_a_run_cannot_end_the_script(made: MadeRun) -> None:
     attempt = next(one for one in run.result.attempts if not one.outcome.ok)
     outcome = replace(attempt.outcome, detail="</script><b>")  # type: ignore[type-var]
     attempts = tuple(replace(one, outcome=outcome) if one is attempt else one for one in run.result.attempts)
-    page = loops.top_view(replace(run, result=replace(run.result, attempts=attempts)), {})
+    empty = np.empty((0, 3), np.float32), np.empty(0, np.uint8)
+    page = loops.top_view(replace(run, result=replace(run.result, attempts=attempts)), lambda _: empty)
     assert "</script><b>" not in page
     assert any("</script><b>" in loop["text"] for loop in _data(page)["loops"])
 

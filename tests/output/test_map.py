@@ -129,9 +129,9 @@ def test_the_map_by_odometry_is_smeared_and_the_corrected_one_is_not(tmp_path: P
     off = geometry.transform(np.eye(3), [3.0, 2.0, 0.0])
     yard = [replace(k, T_odom_keyframe=off @ T if k.id >= 3 else T) for k, T in placed_keyframes(None)]
     poses = {k.id: T for k, T in placed_keyframes(None)}
-    drawn = BeforeAfter({k.id: k.T_odom_keyframe for k in yard}, GraphEstimate(poses, 0.0, {(4, 0): 1.0, (5, 1): 0.0}))
-    for keyframe in yard:
-        drawn.add(keyframe)
+    clouds = {k.id: (k.points, k.labels) for k in yard}
+    estimate = GraphEstimate(poses, 0.0, {(4, 0): 1.0, (5, 1): 0.0})
+    drawn = BeforeAfter({k.id: k.T_odom_keyframe for k in yard}, estimate, list(clouds), clouds.__getitem__)
     (tmp_path / "picture.png").write_bytes(drawn.draw())
     picture = imread(tmp_path / "picture.png")[:, :, :3].mean(axis=2)
     lit = [(half > 0.15).mean() for half in np.array_split(picture[40:], 2, axis=1)]

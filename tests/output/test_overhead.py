@@ -1,5 +1,6 @@
 """Ceilings over the path are cut from pictures, and nothing below the open sky."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,12 +10,12 @@ from helpers.rooms import HALF_M, SENSOR_M, placed_keyframes
 from matplotlib.image import imread
 
 from segslam import open_dataset
-from segslam.core import geometry
+from segslam.core import geometry, processes
 from segslam.core.config import MapConfig
 from segslam.core.types import GraphEstimate, Keyframe, Label, Transform
 from segslam.labels.encodings import COLORS
 from segslam.output.map.before_after import BeforeAfter
-from segslam.output.map.from_above import LEAST_PX, cut_heights, visible
+from segslam.output.map.from_above import LEAST_PX, cut_heights, free_heights, visible
 from segslam.output.map.picture import MARGIN_M
 from segslam.output.map.write import write_map
 
@@ -25,6 +26,10 @@ PATH = np.column_stack([np.arange(0.0, 60.0, 2.0), np.zeros(30), np.zeros(30)])
 def _slab(height_m: float, first_m: float = -5.0, last_m: float = 65.0) -> np.ndarray:
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(first_m, last_m, 0.2), np.arange(-5.0, 5.0, 0.2)))
     return np.column_stack([x, y, np.full(len(x), height_m)])
+
+
+def _cut(clouds: list[np.ndarray]) -> np.ndarray:
+    return cut_heights(PATH, free_heights(PATH, clouds))
 
 
 def _roofed() -> list[tuple[Keyframe, Transform]]:
@@ -41,7 +46,7 @@ def _roofed() -> list[tuple[Keyframe, Transform]]:
 
 
 def test_the_cut_is_half_way_up_to_the_ceiling_and_the_floor_stays_visible() -> None:
-    cut_m = cut_heights(PATH, [_slab(-1.5), _slab(1.0)])
+    cut_m = _cut([_slab(-1.5), _slab(1.0)])
     np.testing.assert_allclose(cut_m, 0.5)
     assert visible(_slab(-1.5), PATH, cut_m).all()
     assert not visible(_slab(1.0), PATH, cut_m).any()
@@ -50,13 +55,13 @@ def test_the_cut_is_half_way_up_to_the_ceiling_and_the_floor_stays_visible() -> 
 def test_where_the_sky_is_open_nothing_is_cut() -> None:
     trees = [_slab(3.0, x - 1.0, x + 1.0) for x in (10.0, 30.0, 50.0)]
     mount = [_slab(0.4)]
-    cut_m = cut_heights(PATH, [_slab(-1.5), *trees, *mount])
+    cut_m = _cut([_slab(-1.5), *trees, *mount])
     assert np.isinf(cut_m).all()
     assert visible(_slab(9.0), PATH, cut_m).all()
 
 
 def test_a_building_on_the_way_is_cut_and_the_street_is_not() -> None:
-    cut_m = cut_heights(PATH, [_slab(2.0, 20.0, 65.0)])
+    cut_m = _cut([_slab(2.0, 20.0, 65.0)])
     assert np.isinf(cut_m[:8]).all()
     np.testing.assert_allclose(cut_m[12:], 1.0)
 
@@ -70,12 +75,7 @@ def test_both_pictures_show_the_floor_below_a_ceiling(tmp_path: Path) -> None:
     assert np.abs(floor - road).max() <= 3
     drawn = []
     for yard in (_roofed(), placed_keyframes(None)):
-        poses = {keyframe.id: T for keyframe, T in yard}
-        keyframes = [replace(keyframe, T_odom_keyframe=T) for keyframe, T in yard]
-        both = BeforeAfter(poses, GraphEstimate(poses, 0.0, {}), keyframes)
-        for keyframe in keyframes:
-            both.add(keyframe)
-        (tmp_path / "both.png").write_bytes(both.draw())
+        (tmp_path / "both.png").write_bytes(_before_after(yard).draw())
         drawn.append((imread(tmp_path / "both.png")[40:, :, :3].mean(axis=2) > 0.3).mean())
     assert drawn[0] < drawn[1] + 0.01  # without the cut, the ceiling would fill the yard
 
@@ -90,14 +90,28 @@ def test_a_roofed_courtyard_is_cut_everywhere_and_a_campus_nowhere(
     scans = open_dataset(data_dir / name, labels="none", frames=frames)
     placed = [geometry.apply(poses[int(scan.index or 0)], scan.points.astype(float)) for scan in scans]
     path_m = np.array([poses[int(scan.index or 0)][:3, 3] for scan in scans])
-    assert np.isfinite(cut_heights(path_m, placed)).mean() == share
+    assert np.isfinite(cut_heights(path_m, free_heights(path_m, placed))).mean() == share
 
 
 def test_the_clouds_of_a_loop_are_shown_without_the_ceiling() -> None:
     roofed = _roofed()
-    poses = {keyframe.id: T for keyframe, T in roofed}
-    drawn = BeforeAfter(poses, GraphEstimate(poses, 0.0, {}), [keyframe for keyframe, _ in roofed])
+    drawn = _before_after(roofed)
     for keyframe, _ in roofed:
-        below = drawn.below_ceiling(keyframe)
-        assert below.points[:, 2].max() < CEILING_M
-        assert len(below.points) == len(below.labels) > 0
+        points, labels = drawn.below_ceiling(keyframe.id)
+        assert points[:, 2].max() < CEILING_M
+        assert len(points) == len(labels) > 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="one process elsewhere")
+def test_pictures_have_the_same_bytes_with_any_number_of_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = set[bytes]()
+    for number in (1, 2, 4):
+        monkeypatch.setattr(processes, "_num_processes", lambda number=number: number)
+        drawn.add(_before_after(_roofed()).draw())
+    assert len(drawn) == 1
+
+
+def _before_after(yard: list[tuple[Keyframe, Transform]]) -> BeforeAfter:
+    poses = {keyframe.id: T for keyframe, T in yard}
+    clouds = {keyframe.id: (keyframe.points, keyframe.labels) for keyframe, _ in yard}
+    return BeforeAfter(poses, GraphEstimate(poses, 0.0, {}), list(clouds), clouds.__getitem__)

@@ -243,8 +243,10 @@ def test_a_drive_through_another_town_is_not_localised(
     days: Days, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     elsewhere = write_day(tmp_path / "scans", day=0, first=0, num_scans=5, seed=8)
-    assert run("localise", days.monday.folder, elsewhere, "--out", tmp_path / "run", "--quiet") == 1
+    out = ("--out", tmp_path / "run", "--map-file", "map.ply")
+    assert run("localise", days.monday.folder, elsewhere, *out, "--quiet") == 1
     assert "no scan was found in the map" in capsys.readouterr().err
     assert (tmp_path / "run" / "poses_tum.txt").read_text() == ""
     rows = (tmp_path / "run" / "localised.csv").read_text().splitlines()[1:]
     assert [row.split(",")[2:] for row in rows] == 5 * [["0", ""]]
+    assert not (tmp_path / "run" / "map.ply").exists()

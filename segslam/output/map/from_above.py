@@ -125,31 +125,39 @@ def png(figure: Figure, *, dpi: int = DPI) -> bytes:
     return image.getvalue()
 
 
-def cut_heights(path_m: Points, clouds: Iterable[Points]) -> Vector:
+def cut_heights(path_m: Points, free_m: Vector) -> Vector:
     """Height (n,) in the world (m) above which points near each position of the path hide the picture; inf: none do.
 
-    The sensor has passed through free space, and the lowest point above a position ends this space. Where most of the
-    neighbouring positions have such a point, the sensor drove below a ceiling, and points higher than half way up to it
-    are cut. Below the open sky, trees and wires hang over few positions: over 1 % of the real KITTI 00, so that nothing
-    is cut; over 100 % of a roofed courtyard. An avenue whose trees meet above the path (17 keyframes of NCLT) is cut
-    like a ceiling. `clouds`: the points (k, 3) of the map in the world, in any pieces.
+    The sensor has passed through free space, and the lowest point above a position ends this space (`free_heights`).
+    Where most of the neighbouring positions have such a point, the sensor drove below a ceiling, and points higher than
+    half way up to it are cut. Below the open sky, trees and wires hang over few positions: over 1 % of the real KITTI
+    00, so that nothing is cut; over 100 % of a roofed courtyard. An avenue whose trees meet above the path (17
+    keyframes of NCLT) is cut like a ceiling.
     """
-    tree = cKDTree(path_m[:, :2])
-    free_m = np.full(len(path_m), np.inf)
-    lowest_m = path_m[:, 2].min()
-    for cloud in clouds:
-        points = cloud[cloud[:, 2] > lowest_m + LOWEST_M]  # others are over no position
-        away_m, row = tree.query(points[:, :2], distance_upper_bound=BESIDE_M, workers=-1)
-        beside = np.isfinite(away_m)
-        above_m = points[beside, 2] - path_m[row[beside], 2]
-        over = above_m > LOWEST_M
-        np.minimum.at(free_m, row[beside][over], above_m[over])
     covered = np.isfinite(free_m)
     inside = uniform_filter1d(covered.astype(float), NEIGHBOURS, mode="nearest") > 0.5
     if not inside.any():
         return np.full(len(path_m), np.inf)
     _, nearest = cKDTree(path_m[covered]).query(path_m)
     return np.where(inside, path_m[:, 2] + SHARE * free_m[covered][nearest], np.inf)
+
+
+def free_heights(path_m: Points, clouds: Iterable[Points]) -> Vector:
+    """Height (n,) above each position of the path of the lowest point that hangs over it (m); inf without one.
+
+    `clouds`: the points (k, 3) of the map in the world, in any pieces.
+    """
+    tree = cKDTree(path_m[:, :2])
+    free_m = np.full(len(path_m), np.inf)
+    lowest_m = path_m[:, 2].min()
+    for cloud in clouds:
+        points = cloud[cloud[:, 2] > lowest_m + LOWEST_M]  # others are over no position
+        away_m, row = tree.query(points[:, :2], distance_upper_bound=BESIDE_M)
+        beside = np.isfinite(away_m)
+        above_m = points[beside, 2] - path_m[row[beside], 2]
+        over = above_m > LOWEST_M
+        np.minimum.at(free_m, row[beside][over], above_m[over])
+    return free_m
 
 
 def visible(points: Points, path_m: Points, cut_m: Vector) -> np.ndarray:

@@ -25,7 +25,7 @@ from segslam.core.types import Keyframe, Label, Points, SegslamError, Transform,
 from segslam.core.whole_files import check_target, whole_file
 from segslam.labels.encodings import of_classes
 from segslam.output.map.clouds import BinaryCloud, LasCloud, PcdCloud, PlyCloud
-from segslam.output.map.from_above import BESIDE_M, cut_heights
+from segslam.output.map.from_above import BESIDE_M, cut_heights, free_heights
 from segslam.output.map.grid import Grid, free_range_m
 from segslam.output.map.picture import GeoTiff, Picture, of_numbers
 from segslam.output.map.tiles import Part, Tile, Tiles, corner, distance_m
@@ -107,7 +107,7 @@ def write_map(
         for keyframe, T_world_keyframe in placed:
             store.add(keyframe, T_world_keyframe)
         if not len(store.tiles):
-            raise SegslamError(f"{files[0]}: no keyframe has a static point; there is nothing to map")
+            raise SegslamError(f"{files[0]}: no keyframe of known pose has a static point; there is nothing to map")
         parts = show(store.parts(), len(store.tiles), "clean")
         num_points = _write(parts, store, files, scratch=scratch / "files")
     return {
@@ -193,7 +193,7 @@ class MapStore:
             for tile in self.tiles
             if any(distance_m(tile, place) < BESIDE_M for place in self.places)
         )
-        return cut_heights(self.path_m, near_path)
+        return cut_heights(self.path_m, free_heights(self.path_m, near_path))
 
     def parts(self) -> Iterator[Part]:
         """The clean voxels of each tile, in the order that `Part` names."""

@@ -1,13 +1,13 @@
 """The report of a run: one HTML page with map, plots, figures and settings, without network access."""
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable
 from html import escape
-from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
-from segslam.core.types import Keyframe, LoopAttempt
+from segslam.core.processes import in_parts
 from segslam.core.whole_files import write_whole
 from segslam.output.finished import FIGURES, FinishedRun, read_run
 from segslam.output.log import read_log
@@ -32,11 +32,10 @@ def write_report(folder: str | Path) -> Path:
     folder = Path(folder)
     run = read_run(folder)
     log = read_log(folder)
-    with matplotlib.rc_context(figures.STYLE):
-        plots = _plots(run)
+    drawings: list[Callable[[FinishedRun], Any]] = [_plots, _pictures]
+    plots, (top, gallery) = in_parts(drawings, lambda part: [draw(run) for draw in part])
     about = {**log.run, "segslam": log.packages.get("segslam", "unknown version")}
     file = folder / "report.html"
-    top, gallery = _pictures(run)
     html = page(run, plots, top=top, gallery=gallery, about=about)
     write_whole(file, html.encode(errors="backslashreplace"))
     return file
@@ -44,10 +43,10 @@ def write_report(folder: str | Path) -> Path:
 
 def draw_before_after(folder: Path) -> bytes:
     """A PNG of the map by odometry beside the corrected map. Raises SegslamError as `write_report`."""
-    picture, _ = _drawn(read_run(folder))
-    return picture
+    return _before_after(read_run(folder)).draw()
 
 
+@matplotlib.rc_context(figures.STYLE)
 def _plots(run: FinishedRun) -> dict[str, str]:
     """The plots by caption, as far as the run contains the data."""
     plots = {"Trajectory, top view and height": figures.draw_paths(run)}
@@ -66,40 +65,21 @@ def _plots(run: FinishedRun) -> dict[str, str]:
 
 def _pictures(run: FinishedRun) -> tuple[str, str]:
     """HTML with pictures of the map, and of pairs of keyframes; most need the clouds of the log."""
-    chosen, shown = loops.choose(run.result.attempts), loops.with_clouds(run)
-    before_after, kept = _drawn(run, _keyframes_of([*chosen, *shown]))
-    of_view = {number: kept[number] for number in sorted(_keyframes_of(shown)) if number in kept}
-    top = section("Top view", loops.top_view(run, of_view))
+    before_after = _before_after(run)
+    top = section("Top view", loops.top_view(run, before_after.below_ceiling))
     note = "Left: before, by odometry. Right: after, as mapped."
-    top += picture_section("Map by odometry, and corrected", before_after, note=note)
+    top += picture_section("Map by odometry, and corrected", before_after.draw(), note=note)
     map_file = run.folder / "map.png"
     if map_file.is_file():
         top += picture_section("Map in top view", small_png(map_file))
-    return top, loops_section(loops.draw(run, chosen, kept))
+    return top, loops_section(loops.draw(run, before_after.below_ceiling))
 
 
-def _keyframes_of(attempts: Iterable[LoopAttempt]) -> set[int]:
-    return {number for one in attempts for number in one.candidate.pair}
-
-
-def _drawn(run: FinishedRun, wanted: Collection[int] = ()) -> tuple[bytes, dict[int, Keyframe]]:
-    """The map before and after, and the keyframes with these ids without ceilings, in two passes over the log."""
+def _before_after(run: FinishedRun) -> BeforeAfter:
+    _, cloud_of = read_log(run.folder).keyframes()
     poses = run.result.odometry.T_world_lidar[run.result.keyframe_rows]
-    every = 1 + len(poses) // MOST_KEYFRAMES
-    kept: dict[int, Keyframe] = {}
-
-    def keyframes() -> Iterator[Keyframe]:
-        steps = read_log(run.folder).steps()
-        return islice((step.keyframe for step in steps if step.keyframe is not None), len(poses))
-
-    drawn = (keyframe for keyframe in keyframes() if keyframe.id % every == 0)
-    before_after = BeforeAfter(dict(enumerate(poses)), run.result.estimate, drawn)
-    for keyframe in keyframes():
-        if keyframe.id % every == 0:
-            before_after.add(keyframe)
-        if keyframe.id in wanted:
-            kept[keyframe.id] = before_after.below_ceiling(keyframe)
-    return before_after.draw(), kept
+    drawn = range(0, len(poses), 1 + len(poses) // MOST_KEYFRAMES)
+    return BeforeAfter(dict(enumerate(poses)), run.result.estimate, drawn, cloud_of)
 
 
 SHOWN = ("num_scans", "length_m", "num_loops_accepted", "ate_m", "odometry_ate_m", "kiss_icp_ate_m")

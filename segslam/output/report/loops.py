@@ -22,7 +22,8 @@ from segslam.core.trajectory import Poses
 from segslam.core.types import (
     GROUND_LABELS,
     REJECTED_WEIGHT,
-    Keyframe,
+    CloudOf,
+    Labels,
     LoopAttempt,
     LoopClosure,
     Points,
@@ -60,14 +61,14 @@ def with_clouds(run: FinishedRun) -> list[LoopAttempt]:
     return kept + [rejected[row] for row in _spread(len(rejected), MOST_PAIRS - len(kept))]
 
 
-def top_view(run: FinishedRun, keyframes: Mapping[int, Keyframe]) -> str:
-    """HTML of the view. `keyframes`: those of `with_clouds`, by id; a loop without them is shown without clouds."""
-    ids = set(keyframes)
+def top_view(run: FinishedRun, cloud_of: CloudOf) -> str:
+    """HTML of the view, with the clouds of some loops: those of `with_clouds`."""
+    ids = {number for attempt in with_clouds(run) for number in attempt.candidate.pair}
     data = {
         "paths": [_path(line.name, line.poses, line.color) for line in paths_of(run)],
         "values": _values(run),
         "loops": [_loop(run, attempt, ids) for attempt in run.result.attempts],
-        "clouds": {str(number): _cloud(keyframe) for number, keyframe in keyframes.items()},
+        "clouds": {str(number): _cloud(*cloud_of(number)) for number in sorted(ids)},
         "step_m": STEP_M,
     }
     script = resources.files("segslam.output.report").joinpath("interactive.js").read_text(encoding="utf-8")
@@ -132,10 +133,10 @@ def _loop(run: FinishedRun, attempt: LoopAttempt, ids: set[int]) -> dict[str, An
     return loop
 
 
-def _cloud(keyframe: Keyframe) -> str:
+def _cloud(points: Points, labels: Labels) -> str:
     """Points above ground in steps of `STEP_M`: 16-bit x, y, z of each, little endian, in base64."""
-    points = _standing(keyframe)
-    points = points if len(points) else keyframe.points
+    standing = _standing(points, labels)
+    points = standing if len(standing) else points
     near = points[np.abs(points).max(axis=1, initial=0.0) < NEAR_M]
     kept = near[_spread(len(near), CLOUD_POINTS)]
     return base64.b64encode(np.round(kept / STEP_M).astype("<i2").tobytes()).decode("ascii")
@@ -166,10 +167,10 @@ def choose(attempts: Sequence[LoopAttempt]) -> list[LoopAttempt]:
     return _apart(accepted) + _apart(rejected)
 
 
-def draw(run: FinishedRun, chosen: Iterable[LoopAttempt], keyframes: Mapping[int, Keyframe]) -> dict[str, bytes]:
-    """A PNG for each candidate, by caption."""
+def draw(run: FinishedRun, cloud_of: CloudOf) -> dict[str, bytes]:
+    """A PNG for each of the candidates of `choose`, by caption."""
     pictures = {}
-    for attempt in chosen:
+    for attempt in choose(run.result.attempts):
         source_id, target_id = attempt.candidate.pair
         T_world = run.result.estimate.T_world_keyframe
         poses = {"initial guess": attempt.candidate.T_target_source_prior}
@@ -177,7 +178,7 @@ def draw(run: FinishedRun, chosen: Iterable[LoopAttempt], keyframes: Mapping[int
             poses["registered"] = attempt.outcome.T_target_source
         else:
             poses["final map"] = geometry.inverse(T_world[target_id]) @ T_world[source_id]
-        source, target = (_standing(keyframes[number]).astype(np.float64) for number in (source_id, target_id))
+        source, target = (_standing(*cloud_of(number)).astype(np.float64) for number in (source_id, target_id))
         caption = f"{source_id} to {target_id}: {outcome_text(attempt, run.result.estimate.closure_weights)}"
         pictures[caption] = draw_pair(source, target, poses=poses, title=f"keyframes {caption}")
     return pictures
@@ -193,9 +194,9 @@ def _apart(ranked: Iterable[tuple[Any, LoopAttempt]]) -> list[LoopAttempt]:
     return chosen
 
 
-def _standing(keyframe: Keyframe) -> Points:
+def _standing(points: Points, labels: Labels) -> Points:
     """The points that are not labelled as ground."""
-    return keyframe.points[~np.isin(keyframe.labels, np.array(GROUND_LABELS, np.uint8))]
+    return points[~np.isin(labels, np.array(GROUND_LABELS, np.uint8))]
 
 
 def draw_pair(source: Points, target: Points, *, poses: Mapping[str, Transform], title: str) -> bytes:

@@ -195,6 +195,9 @@ def test_a_run_from_python_with_its_own_parts_is_not_resumed(
     folder = _started(tmp_path / "run", scans, **(resume_options(DataSource(scans)) | {"python": "odometry"}))
     assert run("resume", folder) == 2
     assert "made from Python with its own odometry" in capsys.readouterr().err
+    map_folder(scans, tmp_path / "placed", frames="0:2", place=lambda _: "")
+    assert run("resume", tmp_path / "placed") == 2
+    assert "made from Python with its own place" in capsys.readouterr().err
 
 
 def test_a_scan_that_is_needed_and_gone_is_reported_with_the_log(

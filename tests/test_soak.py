@@ -1,4 +1,4 @@
-"""Continuous mapping: five minutes, or SEGSLAM_SOAK_S seconds (3600 for the hour).
+"""Continuous mapping: five minutes at least, or SEGSLAM_SOAK_S seconds (3600 for the hour).
 
 SEGSLAM_SOAK_S=3600 bash tools/test.sh -m slow tests/test_soak.py
 """
@@ -35,7 +35,7 @@ FULL = 300
 
 
 class Rounds(Dataset):
-    """Repeats one round for a given time."""
+    """Repeats one round for a given time, on a slow machine for longer: until the second half has full caches."""
 
     name = "rounds"
     labels = UNLABELLED
@@ -57,9 +57,9 @@ class Rounds(Dataset):
         return Trajectory(rows, rows * 300_000_000, round_drive()[1].T_world_lidar[rows % ROUND])
 
     def until_the_end(self, steps: Iterator[Step]) -> Iterator[Step]:
-        for step in steps:
+        for number, step in enumerate(steps):
             yield step
-            if monotonic() > self._end:
+            if number > 2 * FULL and monotonic() > self._end:
                 return
 
 
@@ -82,7 +82,7 @@ def test_continuous_mapping_has_no_leak_lag_or_lost_record(tmp_path: Path) -> No
     recorded = list(read_log(tmp_path / "log.mcap").steps())
     trajectory = read_run(tmp_path).result.trajectory
     assert [step.scan_index for step in recorded] == trajectory.scan_index.tolist() == list(range(len(recorded)))
-    assert len(recorded) >= len(seconds) > 2 * FULL, "too slow a machine for so short a soak"
+    assert len(recorded) >= len(seconds)
 
     rss_mb = _rss_mb(tmp_path / "log.mcap")
     half = len(rss_mb) // 2

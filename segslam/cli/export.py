@@ -99,7 +99,7 @@ def georeference(
     Example: segslam georeference runs/00 --gnss fixes.csv
     """
     check_exists(run, "give the folder of a finished run")
-    terminal.announce(f"georeference: reading {gnss.gnss}")
+    terminal.announce(f"georeference: reading {run}")
     from segslam.output.folder import folder_of
     from segslam.output.georeferenced import FILE
     from segslam.output.log import read_log

@@ -16,6 +16,7 @@ from helpers.commands import run
 from helpers.finished_run import MadeRun, make_run
 from helpers.gnss_drive import ORIGIN, T_ENU_MAP, write_fixes, write_graph
 from helpers.sessions import write_day
+from helpers.terminal import in_terminal
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from pyproj import Transformer
@@ -233,7 +234,10 @@ def test_a_run_without_fixes_has_no_such_files(tmp_path: Path, capsys: pytest.Ca
     write_fixes(tmp_path / "fixes.csv", np.arange(3), np.tile(np.eye(4), (3, 1, 1)))
     assert run("georeference", plain, "--gnss", tmp_path / "fixes.csv") == 2
     assert "adjusted.g2o: missing" in capsys.readouterr().err
-    assert run("georeference", plain) == 2
+    status, printed = in_terminal("-m", "segslam", "georeference", str(plain))
+    assert status == 2
+    assert "give the position fixes" in printed
+    assert "None" not in printed
     assert run("georeference", plain, "--gnss", tmp_path / "fixes.csv", "--gnss-use", "bend") == 2
     assert "known: fuse, align" in capsys.readouterr().err
     assert not (plain / "georeference.json").exists()

@@ -127,7 +127,7 @@ def run_live(
             memory.append((monotonic() - started, rss_mb(live.pid)))
             next_sample += SAMPLE_S
     sleep(3.0)
-    live.send_signal(signal.SIGINT)
+    live.send_signal(signal.SIGTERM)  # a script's background job ignores SIGINT
     printed, told = live.communicate()
     print(told, end="", file=sys.stderr)
     return live.returncode, json.loads(printed), memory, num_sent

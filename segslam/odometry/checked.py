@@ -316,15 +316,11 @@ class CheckedOdometry:
         """
         if not fits or not any(self._search.is_same(scan, fits[0].T_map_lidar, T_start) for T_start in T_map_starts):
             return False
-        is_usual = self._is_usual(fits, least_spread=self._usual_check.spread)  # the map's may be of one place
-        return is_usual or self._search.log_odds(self._map, scan, fits[0]) > -math.log(SIGNIFICANT)
+        return self._is_usual(fits) or self._search.log_odds(self._map, scan, fits[0]) > -math.log(SIGNIFICANT)
 
-    def _is_usual(self, fits: Sequence[Fit], *, least_spread: float = 0.0) -> bool:
+    def _is_usual(self, fits: Sequence[Fit]) -> bool:
         """True if the most likely pose explains the scan as usual; False if there is none."""
-        if not fits:
-            return False
-        least_spread = max(least_spread, fits[0].num_patches ** -0.5)
-        return self._usual_fit.includes(fits[0].mean_log, least_spread=least_spread)
+        return bool(fits) and self._usual_fit.includes(fits[0].mean_log, least_spread=fits[0].num_patches ** -0.5)
 
     def _state(self, off: float, covariance: Information, *, is_unlikely: bool) -> MotionState:
         """Name of the result. `off`, which is noted, and `is_unlikely` compare the odometry's pose with the one kept.

@@ -58,16 +58,15 @@ class Usual:
         self._values: deque[float] = deque(maxlen=WINDOW)
 
     def includes(self, value: float, *, least_spread: float) -> bool:
-        """True if the value is not below the median by more than three standard deviations; False if none is known."""
-        return bool(self._values) and value >= median(self._values) - 3.0 * max(self.spread, least_spread)
+        """True if the value is not below the median by more than three standard deviations; False if none is known.
 
-    @property
-    def spread(self) -> float:
-        """Standard deviation of a normal distribution with the same median absolute deviation; 0 if none is known."""
+        The standard deviation is that of a normal distribution with the same median absolute deviation.
+        """
         if not self._values:
-            return 0.0
+            return False
         middle = median(self._values)
-        return 1.4826 * median(abs(other - middle) for other in self._values)
+        spread = 1.4826 * median(abs(other - middle) for other in self._values)
+        return value >= middle - 3.0 * max(spread, least_spread)
 
     def note(self, value: float) -> None:
         """Add a value."""

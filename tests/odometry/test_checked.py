@@ -283,7 +283,7 @@ def test_the_local_map_is_given_up_where_a_scan_is_more_probably_elsewhere(
     none = Rejected(RejectReason.HIGH_RESIDUAL)
     odometry = CheckedOdometry(_LikeKiss(truth, CONFIG.odometry), CONFIG, recover=lambda source, target: none)
     _registered(odometry, scans[:SLIP_AT])
-    monkeypatch.setattr(odometry, "_is_usual", lambda fits, **_: False)
+    monkeypatch.setattr(odometry, "_is_usual", lambda fits: False)
     monkeypatch.setattr(odometry._search, "elsewhere", lambda scan, fits: probability)
     motion = odometry.register(scans[SLIP_AT]).motion
     assert motion is not None
@@ -419,7 +419,7 @@ def test_a_scan_of_an_unusual_fit_is_searched_around_unless_its_score_is_good(
     odometry = _checked(truth.T_world_lidar)
     _registered(odometry, scans[:SLIP_AT])
     searched: list[object] = []
-    monkeypatch.setattr(odometry, "_is_usual", lambda fits, **_: False)
+    monkeypatch.setattr(odometry, "_is_usual", lambda fits: False)
     monkeypatch.setattr(odometry._search, "log_odds", lambda *_: log_odds)
     monkeypatch.setattr(odometry._search, "around", lambda local, scan, *_, **__: searched.append(scan) or [])
     T_odom_lidar = geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[SLIP_AT]
@@ -427,10 +427,11 @@ def test_a_scan_of_an_unusual_fit_is_searched_around_unless_its_score_is_good(
     assert bool(searched) is is_searched
 
 
-@pytest.mark.parametrize(("spread", "is_searched"), [(0.0, True), (1.0, False)])
-def test_fits_may_vary_as_much_as_those_of_the_checks(
-    spread: float, is_searched: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("spread", [0.0, 1.0])
+def test_a_fit_below_the_last_ones_is_searched_around_however_much_the_checks_vary(
+    spread: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """On NCLT, whose checks are few and long ago, two poses 12 degrees off passed where theirs counted."""
     scans, truth = round_drive()
     odometry = _checked(truth.T_world_lidar)
     _registered(odometry, scans[:SLIP_AT])
@@ -445,7 +446,7 @@ def test_fits_may_vary_as_much_as_those_of_the_checks(
     monkeypatch.setattr(odometry._search, "log_odds", lambda *_: 1.0)
     monkeypatch.setattr(odometry._search, "around", lambda local, scan, *_, **__: searched.append(scan) or [])
     odometry._poses(T_odom_lidar, T_odom_lidar, seen, 1.0)
-    assert bool(searched) is is_searched
+    assert len(searched) == 1
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

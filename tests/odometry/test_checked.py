@@ -431,7 +431,7 @@ def test_a_scan_of_an_unusual_fit_is_searched_around_unless_its_score_is_good(
 def test_a_fit_below_the_last_ones_is_searched_around_however_much_the_checks_vary(
     spread: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On NCLT, whose checks are few and long ago, two poses 12 degrees off passed where theirs counted."""
+    """On NCLT the checks are few and of the start of the drive, and say nothing of the scans there are now."""
     scans, truth = round_drive()
     odometry = _checked(truth.T_world_lidar)
     _registered(odometry, scans[:SLIP_AT])

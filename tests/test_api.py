@@ -117,6 +117,7 @@ def test_a_folder_without_usable_scans_is_an_error(tmp_path: Path) -> None:
         segslam.map_folder(tmp_path / "kitti", tmp_path / "run")
 
 
+@pytest.mark.long
 def test_a_run_is_evaluated_exported_and_reported_by_public_names(made: MadeRun, tmp_path: Path) -> None:
     run = segslam.read_run(made.folder)
     figures = segslam.evaluate(run)
@@ -146,6 +147,7 @@ def test_odd_arguments_are_refused_in_one_line(tmp_path: Path) -> None:
         segslam.fleet([], tmp_path / "city")
 
 
+@pytest.mark.long
 def test_a_run_is_replayed_with_other_settings(tmp_path: Path) -> None:
     write_kitti_sequence(tmp_path / "kitti", num_scans=5)
     first = segslam.map_folder(tmp_path / "kitti", tmp_path / "run")

@@ -66,6 +66,7 @@ def test_module_imports_from_lower_layers_only(file: Path) -> None:
             assert LEVEL[part] < LEVEL[other], f"{part} imports {name}"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_library_is_imported_only_where_the_page_lists_it(library: str) -> None:
     importers = [

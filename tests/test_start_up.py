@@ -107,6 +107,7 @@ def test_every_long_command_prints_a_message_before_it_imports_large_libraries(t
         assert not HEAVY & set(modules), command
 
 
+@pytest.mark.long
 def test_registering_two_scans_loads_neither_the_baselines_nor_the_graph(data_dir: Path) -> None:
     scans = [str(data_dir / "kitti" / "sequences" / "00" / "velodyne" / f"00000{k}.bin") for k in (0, 2)]
     status, modules, text = _imported("register", *scans, "--dataset", "kitti")

@@ -24,21 +24,21 @@ class FirstOfEachKind(logging.Handler):
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
         self._counts: Counter[tuple[str, str]] = Counter()
-        self._first: dict[tuple[str, str], str] = {}
+        self._last: dict[tuple[str, str], str] = {}
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print or count a warning."""
         kind = (record.name, str(record.msg))
         self._counts[kind] += 1
-        if kind not in self._first:
-            self._first[kind] = f"{record.levelname}: {record.getMessage()}"
-            say(f"segslam: {self._first[kind]}")
+        if kind not in self._last:
+            say(f"segslam: {record.levelname}: {record.getMessage()}")
+        self._last[kind] = record.getMessage()
 
     def print_counts(self) -> None:
         """Print the number of further warnings of each kind."""
         for kind, num_warnings in self._counts.items():
             if num_warnings > 1:
-                say(f"segslam: {num_warnings - 1} more warnings like this: {self._first[kind]}")
+                say(f"segslam: {num_warnings - 1} more warnings like this, the last: {self._last[kind]}")
         self._counts.clear()
 
 

@@ -88,11 +88,14 @@ def evaluate(
             rows = {estimate.stem: figures}
     else:
         raise SegslamError("give either a run folder, or two files with --estimate and --reference")
+    if how.rpe_distance is not None and not any("rpe_distance_m" in row for row in rows.values()):
+        terminal.say(f"--rpe-distance {how.rpe_distance:g}: no drive is that long; the error over it is not given")
     tables.write(rows)
-    from segslam.output.accuracy import MEANINGS
+    from segslam.output.accuracy import AFTER, MEANINGS
     from segslam.output.finished import FIGURES
 
     meanings = {"ate_m": FIGURES["ate_m"]} | MEANINGS | FIGURES
+    meanings = {key: words.replace(AFTER["se3"], AFTER[how.align]) for key, words in meanings.items()}
     terminal.table(figures, as_text(rows) if "drives" in figures else with_meanings([figures], meanings))
     if plot is not None and not terminal.json:
         terminal.say(f"figure written to {plot}")
@@ -121,16 +124,15 @@ def _score_run(
     if len(reference) < num_scans:
         terminal.say(f"scored the {len(reference)} of {num_scans} scans that have a reference pose")
     metrics = {key: value for key, value in run.metrics.items() if plain_name(key) not in ACCURACY}
-    metrics |= figures
+    metrics |= figures if how.align == "se3" else accuracy(run.result, reference, align=how.align)
     matched, truth = matched_poses(run.result.trajectory, reference)
     if how.align == "se3":
         write_metrics(folder, metrics)
     if plot is not None:
         from segslam.output.report.comparison import draw_scored
 
-        draw_scored(plot, matched, truth)
-    more = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance)
-    return more | metrics if how.align == "se3" else metrics | more
+        draw_scored(plot, matched, truth, align=how.align)
+    return scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance) | metrics
 
 
 def _score_folders(estimates: Path, references: Path, how: Scoring) -> dict[str, dict[str, Any]]:
@@ -191,7 +193,7 @@ def _score_files(
     if plot is not None:
         from segslam.output.report.comparison import draw_scored
 
-        draw_scored(plot, matched, truth, up=up)
+        draw_scored(plot, matched, truth, align=how.align, up=up)
     if not len(matched) == len(estimate) == len(reference):
         terminal.say(f"scored {len(matched)} poses; estimate {len(estimate)}, reference {len(reference)}")
     return figures | {"num_poses": len(matched), "up": up}

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from segslam.output.log import RunLog
 
 SHOWN = (
-    *("num_scans", "num_keyframes", "length_m", "duration_s", "num_candidates", "num_loops_accepted"),
+    *("num_scans", "num_scans_skipped", "num_scans_left", "num_keyframes", "length_m", "duration_s"),
+    *("num_candidates", "num_loops_accepted"),
     *("num_motions_repaired", "num_motions_broken", "ate_m", "odometry_ate_m", "kiss_icp_ate_m", "map_thickness_m"),
 )
 """Figures of the run that are shown, if known."""
@@ -91,6 +92,8 @@ def _found_in(log: "RunLog") -> dict[str, Any]:
     folder = log.path.parent
     state = "in progress" if is_being_written(log.path) else "finished" if log.result() else "interrupted"
     metrics = read_metrics(folder) if (folder / "metrics.json").is_file() else {}
+    if state == "finished" and metrics.get("num_scans_left"):
+        state = "interrupted"
     return {
         "run": str(folder),
         "data": log.run.get("dataset", ""),

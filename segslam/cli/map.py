@@ -238,7 +238,7 @@ def _show_complete(
     from segslam.output.report import write_report
 
     folder = recorded.path.parent
-    terminal.say(f"{folder}: the run is already complete; there is nothing to resume")
+    terminal.say(f"{folder}: the run is already complete; no scan is left to map")
     if place is not None and not (folder / PLACE_ON_GLOBE).exists():
         terminal.say(place(folder))
         write_report(folder)
@@ -311,8 +311,9 @@ def _map_scans(
         if stopped and run.num_steps == 0:
             when_stopped("no scan was mapped, nothing was written")
             raise typer.Exit(EXIT_STATUS)
-        resumed = {} if recorded is None else {"num_scans_resumed": run.num_scans_resumed}
-        metrics = finish(run, terminal, map_files=map_files, more=lambda _: resumed, stopped=stopped, place=place)
+        more = {} if recorded is None else {"num_scans_resumed": run.num_scans_resumed}
+        more |= {"num_scans_left": len(scans) - run.num_steps - run.num_scans_skipped} if stopped else {}
+        metrics = finish(run, terminal, map_files=map_files, more=lambda _: more, stopped=stopped, place=place)
     if stopped:
         when_stopped(f"{metrics['num_scans']} of {len(scans)} scans are mapped; {go_on}")
         raise typer.Exit(EXIT_STATUS)

@@ -22,6 +22,13 @@ from segslam.slam.slam import SlamResult
 
 Align = Literal["se3", "sim3", "first", "none"]
 """Alignment of the estimate: rigid (the default everywhere), with scale, by the first pose, or none."""
+AFTER: dict[Align, str] = {
+    "se3": "after alignment",
+    "sim3": "after alignment with scale",
+    "first": "after alignment of the first poses",
+    "none": "without alignment",
+}
+"""How an error was measured, in words."""
 MOST_OFF = 0.1
 """Largest difference between the length of a pair and the distance asked for, as a share; evo's default."""
 MEANINGS = {
@@ -36,8 +43,8 @@ MEANINGS = {
 """Meaning of the figures that only the evaluation has."""
 
 
-def accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:
-    """The figures of `metrics.json` that need ground truth.
+def accuracy(result: SlamResult, reference: Trajectory, *, align: Align = "se3") -> dict[str, float]:
+    """The figures of `metrics.json` that need ground truth; after another alignment, if it is given.
 
     Those of the odometry after repairs start with `odometry_`, those of KISS-ICP alone, if known, with `kiss_icp_`. A
     drive localised in a map has no figures of loops, because loops within it are not searched.
@@ -47,7 +54,7 @@ def accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:
         prefix + name: value
         for prefix, trajectory in trajectories.items()
         if trajectory is not None
-        for name, value in trajectory_accuracy(trajectory, reference).items()
+        for name, value in trajectory_accuracy(trajectory, reference, align=align).items()
     }
     if result.from_map_m is not None:
         return figures
@@ -55,10 +62,10 @@ def accuracy(result: SlamResult, reference: Trajectory) -> dict[str, float]:
     return figures | loop_metrics(*measured)
 
 
-def trajectory_accuracy(trajectory: Trajectory, reference: Trajectory) -> dict[str, float]:
-    """`trajectory_metrics` of the scans that have a true pose."""
+def trajectory_accuracy(trajectory: Trajectory, reference: Trajectory, *, align: Align = "se3") -> dict[str, float]:
+    """`trajectory_metrics` of the scans that have a true pose, after this alignment."""
     rows = rows_of_same_scan(trajectory.scan_index, reference.scan_index)
-    return trajectory_metrics(trajectory.T_world_lidar[rows[:, 0]], reference.T_world_lidar[rows[:, 1]])
+    return _metrics(trajectory.T_world_lidar[rows[:, 0]], reference.T_world_lidar[rows[:, 1]], align, Z_UP)
 
 
 def judged_closures(result: SlamResult, reference: Trajectory) -> tuple[list[LoopClosure], Poses, IndexPairs, Poses]:
@@ -84,34 +91,43 @@ def scores(
     Empty for fewer than 3 rows. `rpe_distance_m` adds the error of the motion between poses this far apart along the
     true path; none is given if the drive is shorter. With `sim3` all figures are of the scaled estimate.
     """
-    if len(reference) < MIN_POSES:
+    figures = _metrics(estimate, reference, align, up)
+    if not figures:
         return {}
-    scale = scale_of(estimate[:, :3, 3], reference[:, :3, 3]) if align == "sim3" else 1.0
-    scaled = estimate.copy()
-    scaled[:, :3, 3] *= scale
-    aligned = aligned_by(scaled, reference, align)
-    figures = trajectory_metrics(scaled, reference, up=up)
-    errors = pose_errors(aligned, reference)
-    if align in ("first", "none"):  # trajectory_metrics aligns; these are the errors without it
-        figures["ate_m"] = rms(errors.translation_m)
-        figures["are_deg"] = rms(errors.rotation_deg)
-        figures["height_m"] = rms((aligned - reference)[:, :3, 3] @ np.array(up))
+    aligned = aligned_by(estimate, reference, align)
+    errors_m = pose_errors(aligned, reference).translation_m
     figures |= {
-        "ate_mean_m": float(errors.translation_m.mean()),
-        "ate_median_m": float(np.median(errors.translation_m)),
-        "ate_max_m": float(errors.translation_m.max()),
+        "ate_mean_m": float(errors_m.mean()),
+        "ate_median_m": float(np.median(errors_m)),
+        "ate_max_m": float(errors_m.max()),
     }
     if align == "sim3":
-        figures["scale"] = scale
+        figures["scale"] = scale_of(estimate[:, :3, 3], reference[:, :3, 3])
     return figures | ({} if rpe_distance_m is None else _over_distance(aligned, reference, rpe_distance_m))
 
 
+def _metrics(estimate: Poses, reference: Poses, align: Align, up: tuple[float, float, float]) -> dict[str, float]:
+    if align == "se3" or len(reference) < MIN_POSES:
+        return trajectory_metrics(estimate, reference, up=up)
+    aligned = aligned_by(estimate, reference, align)
+    figures = trajectory_metrics(aligned, reference, up=up)
+    if align in ("first", "none"):  # trajectory_metrics aligns; these are the errors without it
+        errors = pose_errors(aligned, reference)
+        figures["ate_m"] = rms(errors.translation_m)
+        figures["are_deg"] = rms(errors.rotation_deg)
+        figures["height_m"] = rms((aligned - reference)[:, :3, 3] @ np.array(up))
+    return figures
+
+
 def aligned_by(estimate: Poses, reference: Poses, align: Align) -> Poses:
-    """The estimate in the frame of the reference; for `sim3` the estimate must be scaled before."""
+    """The estimate in the frame of the reference; (n, 4, 4) each, row by row."""
     if align == "none":
         return estimate
     if align == "first":
         return reference[0] @ geometry.inverse(estimate[0]) @ estimate
+    if align == "sim3":
+        estimate = estimate.copy()
+        estimate[:, :3, 3] *= scale_of(estimate[:, :3, 3], reference[:, :3, 3])
     return align_positions(estimate[:, :3, 3], reference[:, :3, 3]) @ estimate
 
 

@@ -35,6 +35,7 @@ FIGURES = {
     "duration_s": "duration of the drive (s)",
     "num_scans": "scans mapped",
     "num_scans_skipped": "scans skipped (unreadable or empty)",
+    "num_scans_left": "scans left when the run was stopped",
     "num_keyframes": "keyframes",
     "num_candidates": "loop candidates tried",
     "num_motions_repaired": "motions of the odometry replaced by registrations",

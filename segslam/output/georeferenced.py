@@ -220,9 +220,9 @@ def figures(placed: Georeference) -> dict[str, Any]:
         "is_bent_horizontally": placed.is_bent[0],
         "is_bent_in_height": placed.is_bent[1],
         "clock_offset_s": placed.measured_offset_s,
-        "clock_offset_sigma_s": placed.offset_sigma_s,
+        "clock_offset_sigma_s": placed.offset_sigma_s or None,
         "lever_arm_m": _known(placed.arm_m),
-        "lever_arm_sigma_m": _known(placed.arm_sigma_m),
+        "lever_arm_sigma_m": [sigma_m or None for sigma_m in _known(placed.arm_sigma_m)],
         "source": Path(placed.fixes.source).name,
         "note": placed.fixes.note,
     }

@@ -171,7 +171,7 @@ def make_scan(
     kept = np.isfinite(squared_range) & (squared_range > 0)
     if not kept.any():
         what = "has no points" if len(points) == 0 else f"none of its {len(points)} points is finite and not 0, 0, 0"
-        raise BadScan(f"{source}: {what}; copy the file again or omit the scan with --frames")
+        raise BadScan(f"{source}: {what}; copy the file again, or leave this scan out")
     if not kept.all():
         points, labels, times = points[kept], of_rows(labels, kept), times[kept] if len(times) else times
         intensities = intensities if intensities is None else intensities[kept]

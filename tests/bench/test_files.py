@@ -95,6 +95,7 @@ def test_stopped_in_the_middle_it_is_a_shorter_sequence(drive, sweeps, tmp_path,
     assert len(dataset.reference) == 2
 
 
+@pytest.mark.long
 def test_fewer_scans_are_the_same_scans(tmp_path):
     drive = example_drive()
     for name, count in (("a", 1), ("b", 2)):

@@ -42,6 +42,7 @@ def test_every_name_is_a_method() -> None:
     assert tuple(METHODS) == METHOD_NAMES
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", METHOD_NAMES)
 def test_a_method_finds_the_pose_of_two_near_scans(name: str, parts: tuple[dict[str, Any], dict[str, Any]]) -> None:
     """FPFH alone is inaccurate in simulated streets, so only the success criterion is tested for all methods."""
@@ -56,6 +57,7 @@ def test_a_method_finds_the_pose_of_two_near_scans(name: str, parts: tuple[dict[
         assert geometry.distance(error) < 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["segregator-c2f", "gicp", "vgicp", "fgr"])
 def test_parts_sent_to_another_process_give_the_same_pose(
     name: str, parts: tuple[dict[str, Any], dict[str, Any]]

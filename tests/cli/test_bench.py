@@ -110,6 +110,7 @@ def test_yaw_turns_the_source_of_the_papers_pair(
     assert "Success (%) by yaw" in (tmp_path / "report.md").read_text()
 
 
+@pytest.mark.long
 def test_deterioration_takes_labels_from_one_scan_or_both(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -43,6 +43,7 @@ def calibrated(data: Path, capsys: pytest.CaptureFixture[str], *options: str) ->
     return json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.long
 def test_the_angle_is_measured_and_no_error_remains_after_setting_it(
     yard: Path, given: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -80,6 +81,7 @@ def test_a_drive_too_short_for_the_angle_gives_none(tmp_path: Path, capsys: pyte
     assert "the vertical angle cannot be measured" in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("short_runs")
 @pytest.mark.parametrize(("options", "kept_deg"), [([], 0.205), (["--set", "sensor.vertical_angle_deg=0"], 0.0)])
 def test_a_run_keeps_the_angle_that_its_scans_were_read_with(

@@ -9,7 +9,7 @@ from helpers.commands import run
 from segslam.core.types import LoopClosure
 from segslam.output.log import read_log
 
-pytestmark = pytest.mark.usefixtures("short_runs")
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("short_runs")]
 
 QUICK = ("--set", "adjustment.max_minutes=0", "--quiet")
 

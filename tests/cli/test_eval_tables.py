@@ -4,6 +4,7 @@ import csv
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.commands import run
 from helpers.drives import drifting, round_drive
@@ -12,6 +13,7 @@ from helpers.finished_run import make_run
 from segslam.cli.tables import SHORT, as_text
 from segslam.core.trajectory import write_kitti
 from segslam.output.accuracy import scores
+from segslam.output.report import figures
 
 TRUTH = round_drive()[1]
 ESTIMATE = drifting(TRUTH).T_world_lidar
@@ -70,10 +72,29 @@ def test_the_alignment_is_chosen_and_only_the_rigid_one_is_kept_with_a_run(
     expected = scores(made.result.trajectory.T_world_lidar, made.truth.T_world_lidar, align=align, rpe_distance_m=50.0)  # type: ignore[arg-type]
     for key, value in expected.items():
         assert found[key] == pytest.approx(value, abs=1e-6), key
+    odometry = scores(made.result.odometry.T_world_lidar, made.truth.T_world_lidar, align=align)  # type: ignore[arg-type]
+    assert found["odometry_ate_m"] == pytest.approx(odometry["ate_m"], abs=1e-6)
     after = json.loads((made.folder / "metrics.json").read_text())
     assert "rpe_over_distance_m" in found
     assert "ate_max_m" not in after
     assert (after == before) == (align != "se3")
+
+
+def test_the_alignment_is_named_and_the_picture_has_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, drawn = make_run(tmp_path / "run"), []
+    plot_error = figures.plot_error
+    monkeypatch.setattr(figures, "plot_error", lambda *given: (drawn.append(given[2]), plot_error(*given)))
+    picture = tmp_path / "scored.png"
+    assert run("eval", made.folder, "--align", "none", "--plot", picture) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert "absolute trajectory error without alignment, rms (m)" in words
+    assert "after alignment" not in words
+    assert run("eval", made.folder, "--rpe-distance", 9000) == 0
+    assert "--rpe-distance 9000: no drive is that long" in capsys.readouterr().err
+    np.testing.assert_allclose(drawn[0], made.result.trajectory.T_world_lidar, atol=1e-6)
+    assert picture.exists()
 
 
 def test_compare_writes_its_table(tmp_path: Path) -> None:

@@ -69,6 +69,7 @@ def test_files_read_back_as_the_labels_a_row_for_each_of_the_scan(
     assert (again[1].labels != Label.UNLABELLED).mean() > 0.99
 
 
+@pytest.mark.long
 def test_scores_drop_for_a_network_whose_classes_are_shifted_by_one(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -97,6 +98,7 @@ def test_the_confusion_is_written_with_the_names_of_the_classes(
     assert np.trace(counts[:, 1:]) == counts.sum() > 100_000
 
 
+@pytest.mark.long
 def test_pictures_show_each_class_in_its_colour(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -174,6 +176,7 @@ def test_scores_are_intersections_over_unions_of_the_points_whose_class_is_known
     assert right != wrong
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_geometric_labels_on_real_scans_score_as_measured(
     data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -54,6 +54,7 @@ def test_map_writes_a_whole_run_and_skips_the_bad_scan(
     assert metrics["duration_s"] == pytest.approx(2.7)
 
 
+@pytest.mark.long
 def test_the_end_of_map_leads_on(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Length and duration, the error by stage, the report, the next command; also of a replay."""
     out = tmp_path / "my run"
@@ -130,6 +131,7 @@ def test_a_given_odometry_is_cropped_by_the_ranges_of_the_preset(
     assert ranges_m == [40.0]
 
 
+@pytest.mark.long
 def test_a_given_odometry_is_used_unchanged(kitti: Path, tmp_path: Path) -> None:
     given = tmp_path / "given.txt"
     write_kitti(given, round_drive()[1].T_world_lidar)

@@ -30,6 +30,7 @@ def test_export_writes_each_kind_by_its_ending(
     assert len(o3d.io.read_point_cloud(str(files[0])).points) == figures["num_map_points"] > 0
 
 
+@pytest.mark.long
 def test_export_draws_the_map_before_and_after_loop_closing(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -98,6 +99,7 @@ def test_an_unfinished_run_has_no_map(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "did not finish" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_map_writes_the_map_with_the_run_and_adds_missing_maps_to_a_finished_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

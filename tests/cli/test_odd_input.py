@@ -227,6 +227,7 @@ cli.main(["export", *sys.argv[1:]])
 """
 
 
+@pytest.mark.long
 def test_sigterm_during_an_export_leaves_no_unfinished_map(tmp_path: Path) -> None:
     folder, target = make_run(tmp_path / "run").folder, tmp_path / "map.ply"
     with subprocess.Popen([sys.executable, "-c", SLOW_EXPORT, folder, target], stderr=subprocess.PIPE) as process:

@@ -62,6 +62,7 @@ def test_the_image_of_a_grid_is_not_replaced_either(
     assert (tmp_path / "grid.pgm").read_bytes() == b"mine"
 
 
+@pytest.mark.long
 def test_map_replaces_a_run_only_if_wanted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data, out = tmp_path / "data", tmp_path / "run"
     write_kitti_sequence(data, num_scans=3)

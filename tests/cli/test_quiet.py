@@ -130,11 +130,13 @@ def test_every_command_is_tried_here() -> None:
     assert {*COMMANDS, *OF_MAPPED} | elsewhere == {name for name, _ in all_commands(get_command(cli.app))}
 
 
+@pytest.mark.long
 def test_json_is_one_value_and_nothing_else(words: Words, capfd: pytest.CaptureFixture[str]) -> None:
     assert run(*words, "--json") == 0
     assert isinstance(json.loads(capfd.readouterr().out), list if words[0] == "locate" else dict)
 
 
+@pytest.mark.long
 def test_quiet_prints_failures_only(
     words: Words, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,6 +16,7 @@ from segslam.slam.adjustment.sweeps import swept
 pytestmark = pytest.mark.usefixtures("short_runs")
 
 
+@pytest.mark.long
 def test_a_run_is_refined_and_keeps_its_loops_and_a_replay_keeps_nothing_of_the_adjustment(
     log: Path, tmp_path: Path
 ) -> None:
@@ -42,6 +43,7 @@ def test_a_run_is_refined_and_keeps_its_loops_and_a_replay_keeps_nothing_of_the_
         np.testing.assert_array_equal(last.T_world_vertex[vertex], T_world)
 
 
+@pytest.mark.long
 def test_the_motion_within_sweeps_is_corrected_in_the_run_and_in_its_map(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

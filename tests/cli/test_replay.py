@@ -28,6 +28,7 @@ def _pair_and_outcome(attempt: LoopAttempt) -> tuple[Any, ...]:
     return (*pair, attempt.outcome)
 
 
+@pytest.mark.long
 def test_a_replay_with_the_same_settings_repeats_the_run(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -45,6 +46,7 @@ def test_a_replay_with_the_same_settings_repeats_the_run(
     np.testing.assert_allclose(poses_before.T_world_lidar, poses_after.T_world_lidar, rtol=0, atol=1e-9)
 
 
+@pytest.mark.long
 def test_other_settings_change_the_loops_and_the_change_is_printed(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

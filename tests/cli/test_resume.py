@@ -59,7 +59,7 @@ def test_a_run_is_resumed_with_all_its_options(
     num_new = metrics["num_scans"] - metrics["num_scans_resumed"]
     assert num_new / metrics["scans_per_second"] < metrics["seconds_total"]  # which has the reading of the log in it
     assert run("resume", cut) == 0
-    assert "nothing to resume" in capsys.readouterr().err
+    assert "no scan is left to map" in capsys.readouterr().err
 
 
 def test_missing_data_is_reported(kitti: Path, cut: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -57,6 +57,7 @@ def test_bad_usage_is_reported(tmp_path, capsys, arguments, complaint):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_existing_data_is_kept_without_the_option_overwrite(tmp_path, capsys):
     asked = (tmp_path / "out", "--frames", 1, "--sensor", "vlp16", "--quiet")
     assert simulate(*asked) == 0
@@ -66,6 +67,7 @@ def test_existing_data_is_kept_without_the_option_overwrite(tmp_path, capsys):
     assert len(open_dataset(tmp_path / "out", sequence="00")) == 1
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("ctrl_c_works")
 def test_ctrl_c_leaves_a_shorter_sequence(tmp_path):
     with subprocess.Popen(

@@ -22,6 +22,7 @@ def test_all_combinations_are_made() -> None:
             grid_of([empty])
 
 
+@pytest.mark.long
 def test_a_sweep_replays_each_value_once_and_tables_it(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

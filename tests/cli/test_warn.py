@@ -25,13 +25,14 @@ def test_first_warning_of_each_kind_is_printed_and_the_others_counted(capsys: py
             "at once, not at the end"
         )
         handler.print_counts()
-        assert capsys.readouterr().err == "segslam: 2 more warnings like this: WARNING: scan 3 is bad\n"
+        assert capsys.readouterr().err == "segslam: 2 more warnings like this, the last: scan 9 is bad\n"
         handler.print_counts()
         assert capsys.readouterr().err == "", "once"
     finally:
         logger.removeHandler(handler)
 
 
+@pytest.mark.long
 def test_many_bad_scans_make_two_lines(tmp_path: Path) -> None:
 
     for number in range(6):
@@ -42,5 +43,5 @@ def test_many_bad_scans_make_two_lines(tmp_path: Path) -> None:
     output = [line for line in done.stderr.splitlines() if "none of its 50 points" in line]
     assert len(output) == 2
     assert "scan 1" in output[0]
-    assert output[1].startswith("segslam: 4 more warnings like this:")
+    assert output[1].startswith("segslam: 4 more warnings like this, the last: scan 5")
     assert "5 scans skipped (unreadable or empty)" in done.stderr

@@ -62,6 +62,7 @@ def _evo(metric: metrics.PE, reference: PosePath3D, estimate: PosePath3D) -> flo
     return metric.get_statistic(metrics.StatisticsType.rmse)
 
 
+@pytest.mark.long
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "sequence", "known_ate_m"), REAL)
 def test_real_estimates_are_scored_as_evo_and_kitti_score_them(
@@ -281,6 +282,7 @@ def test_no_rotation_error_is_given_where_the_turn_about_a_line_is_not_known() -
     assert trajectory_metrics(estimate, truth)["are_deg"] < 0.1
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_the_upward_axis_of_real_drives_is_found(data_dir: Path) -> None:
     files = {"-y": [*(data_dir / "kitti" / "poses").glob("*.txt"), *(data_dir / "trajectories").glob("*.txt")]}

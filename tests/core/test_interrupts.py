@@ -1,5 +1,6 @@
 """Ctrl-C at any moment: one line with the kept results and the command that continues."""
 
+import json
 import shlex
 import signal
 import subprocess
@@ -110,8 +111,14 @@ def test_an_interrupted_run_continues_with_the_printed_command(
     output = line.partition("continue with: segslam ")[2]
     assert line.startswith("segslam: stopped: ")
     assert shlex.split(output)[:2] == ["resume", str(tmp_path / "a run")]
+    assert run("info", tmp_path / "a run", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["state"] == "interrupted"
+    assert found["num_steps"] + found["figures"]["num_scans_left"] == 5
     assert run(*shlex.split(output), "--json") == 0
-    assert '"num_scans": 5' in capsys.readouterr().out
+    metrics = json.loads(capsys.readouterr().out)
+    assert metrics["num_scans"] == 5
+    assert "num_scans_left" not in metrics
 
 
 def test_before_the_first_scan_nothing_is_left(

@@ -90,6 +90,7 @@ def test_optimize_replaces_a_file_only_if_wanted(graph: Path, capsys: pytest.Cap
     assert graph.read_bytes() != before
 
 
+@pytest.mark.long
 def test_a_full_disk_is_one_line_and_leaves_no_half_file(
     graph: Path, finished: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -172,6 +173,7 @@ def test_labels_on_a_full_disk_are_whole_or_not_there(
     assert not [file for file in tmp_path.rglob("*") if file.is_file()]
 
 
+@pytest.mark.long
 def test_view_saves_a_whole_file_or_none(finished: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     command = [sys.executable, "-m", "segslam", "view", str(finished), "--save", str(tmp_path / "full.rrd"), "--quiet"]
@@ -183,6 +185,7 @@ def test_view_saves_a_whole_file_or_none(finished: Path, tmp_path: Path) -> None
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("arguments", [["--help"], ["map", "--help"], ["eval", "RUN"], ["eval", "RUN", "--json"]])
 def test_a_full_standard_output_is_one_line(finished: Path, arguments: list[str]) -> None:
     command = [sys.executable, "-m", "segslam", *(str(finished) if word == "RUN" else word for word in arguments)]
@@ -194,12 +197,14 @@ def test_a_full_standard_output_is_one_line(finished: Path, arguments: list[str]
     assert "standard output: cannot be written (No space left on device); redirect it elsewhere" in line
 
 
+@pytest.mark.long
 def test_a_closed_pipe_is_not_reported_as_an_error(finished: Path) -> None:
     command = f"{sys.executable} -m segslam eval {finished} --json | true"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120)
     assert done.stderr == ""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", [["report"], ["eval"], ["export"], ["view"], ["replay"]])
 def test_a_run_is_named_by_its_folder_or_its_log(
     finished: Path,

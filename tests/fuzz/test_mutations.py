@@ -80,6 +80,7 @@ def test_a_hang_counts_if_it_repeats(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert [(kind, data) for kind, data in found] == [("hang", b"always")]
 
 
+@pytest.mark.long
 def test_a_child_does_not_delete_what_its_parent_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     deleted, fork = tmp_path / "deleted", os.fork
 

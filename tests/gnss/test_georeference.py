@@ -67,6 +67,7 @@ def test_a_good_drive_is_placed_and_keeps_its_shape() -> None:
     assert found.fix_sigma_m[0] == pytest.approx(0.3, rel=0.3)
 
 
+@pytest.mark.long
 def test_a_drifted_drive_is_bent_by_good_fixes() -> None:
     truth = _truth()
     drifted = _drifted(truth, 0.15)
@@ -78,6 +79,7 @@ def test_a_drifted_drive_is_bent_by_good_fixes() -> None:
     assert fused.is_bent[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("first", [20, pytest.param(150, marks=pytest.mark.slow)])
 def test_a_run_of_wrong_fixes_is_not_kept_and_does_no_harm(first: int) -> None:
     truth = _truth()
@@ -90,6 +92,7 @@ def test_a_run_of_wrong_fixes_is_not_kept_and_does_no_harm(first: int) -> None:
     assert found.reasons.count("contradicts_drive") < 75
 
 
+@pytest.mark.long
 def test_a_clock_that_is_off_is_measured() -> None:
     truth = _truth()
     found = georeference(motions(truth), _drive(truth), _fixes(truth, sigma_m=0.05).shifted(0.5))
@@ -113,6 +116,7 @@ def test_fixes_that_cannot_place_a_drive_are_refused_with_the_reason() -> None:
         georeference(edges, drive, equal)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "longitude", [179.9999, *(pytest.param(one, marks=pytest.mark.slow) for one in (11.9999, -180.0))]
 )

@@ -147,6 +147,7 @@ def _jittering(sigma_m: float, aside_m: float = 0.0) -> list[OdometryResult]:
     return _registered(odometry, scans[: JUMPS_AT + 5])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("sigma_m", "agrees"), [(0.005, True), (0.06, False)])
 def test_every_scan_is_registered_until_the_odometry_agrees_with_a_window_of_registrations(
     sigma_m: float, agrees: bool
@@ -161,6 +162,7 @@ def test_every_scan_is_registered_until_the_odometry_agrees_with_a_window_of_reg
         assert set(states[WINDOW + 1 :]) <= registered
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("metres", "state"), [(0.07, MotionState.CONFIRMED), (0.2, MotionState.REFINED)])
 def test_an_odometry_that_agrees_corrects_its_errors_itself(metres: float, state: MotionState) -> None:
     results, plain = _jittering(0.005, metres), _jittering(0.005)
@@ -476,6 +478,7 @@ def test_a_keyframe_follows_a_break_and_its_motion_has_nearly_no_information() -
     assert [step.motion.state for step in steps if step.motion][20] is MotionState.BROKEN
 
 
+@pytest.mark.long
 def test_a_registration_that_leads_away_from_its_start_is_compared_with_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """It ends two metres beside the true pose, which explains the scan better, though both are as usual."""
     scans, truth = round_drive()
@@ -574,6 +577,7 @@ def test_too_few_points_are_not_checked() -> None:
     assert {result.motion.state for result in results if result.motion} == {MotionState.UNCHECKED}
 
 
+@pytest.mark.long
 def test_recovery_without_initial_guess_runs_only_where_guesses_fail() -> None:
     asked = []
 
@@ -599,6 +603,7 @@ def test_the_quick_check_measures_a_small_slip(moved_m: float) -> None:
     assert geometry.distance(geometry.inverse(T_slipped) @ found) == pytest.approx(moved_m, abs=0.06)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("num_again", [10, pytest.param(70, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "last", [pytest.param(15, marks=pytest.mark.slow), SLIP_AT + 1, pytest.param(SLIP_AT + 12, marks=pytest.mark.slow)]
@@ -785,6 +790,7 @@ def test_motions_that_were_not_shown_turn_with_the_sensor_until_a_new_map_begins
     assert covariance[3, 3] < 0.01, "not the last position but the motion changed"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("is_better", [True, False])
 def test_a_map_before_a_break_is_used_again_if_it_explains_the_scan_better(is_better: bool) -> None:
     scans, truth = round_drive()

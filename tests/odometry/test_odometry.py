@@ -134,6 +134,7 @@ def _followed(odometry: KissOdometry, scans: list[Scan], *, foresees: bool) -> l
     return [result.T_odom_lidar for result in found]
 
 
+@pytest.mark.long
 def test_work_on_the_next_scan_begins_early_and_changes_nothing() -> None:
     scans = [*_street(7), _scan(np.zeros((1, 3)), index=7)]
     with OdometryApart(ONE_THREAD, keeps_alone=True) as plain, OdometryApart(ONE_THREAD, keeps_alone=True) as early:
@@ -170,6 +171,7 @@ def test_a_process_that_was_killed_is_reported_with_the_remedy() -> None:
         odometry.register(scan)
 
 
+@pytest.mark.long
 def test_a_script_that_runs_again_when_imported_ends_with_the_remedy(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(

@@ -69,6 +69,10 @@ def test_the_files_say_where_every_scan_is(made: MadeRun) -> None:
     assert values["epsg"] == 32632
     assert values["num_fixes_kept"] > 100
     assert len(values["T_enu_map"]) == 16
+    assert (values["clock_offset_s"], values["clock_offset_sigma_s"]) == (0.0, None), (
+        "not measured, so not known to 0 s"
+    )
+    assert values["lever_arm_sigma_m"] == [None, None]
     metrics = json.loads((made.folder / "metrics.json").read_text())
     assert metrics["gnss_kept"] + metrics["gnss_dropped"] == values["num_fixes"]
     trajectory = made.result.trajectory
@@ -225,6 +229,7 @@ def _plain_points(file: Path) -> Points:
     return np.asarray(open3d.io.read_point_cloud(str(file)).points)
 
 
+@pytest.mark.long
 def test_a_run_without_fixes_has_no_such_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plain = make_run(tmp_path / "run").folder
     for name in ("map.tif", "track.geojson", "map_projector_info.yaml"):
@@ -260,6 +265,7 @@ def test_a_damaged_file_of_fixes_is_named_by_the_report(made: MadeRun, tmp_path:
         draw_fixes(folder)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("short_runs")
 def test_map_places_a_run_before_its_maps_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data, out = write_day(tmp_path / "monday", day=0, first=0, num_scans=22), tmp_path / "run"
@@ -280,6 +286,7 @@ def test_map_places_a_run_before_its_maps_are_written(tmp_path: Path, capsys: py
     assert np.hypot(*off_m[:, :2].T).max() < 0.3
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("short_runs")
 def test_fixes_that_place_nothing_leave_the_maps_and_others_place_the_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -66,6 +66,7 @@ def test_a_building_on_the_way_is_cut_and_the_street_is_not() -> None:
     np.testing.assert_allclose(cut_m[12:], 1.0)
 
 
+@pytest.mark.long
 def test_both_pictures_show_the_floor_below_a_ceiling(tmp_path: Path) -> None:
     write_map(_roofed(), [tmp_path / "map.png"], config=MapConfig())
     picture = np.rint(255 * imread(tmp_path / "map.png")[:, :, :3]).astype(int)
@@ -102,6 +103,7 @@ def test_the_clouds_of_a_loop_are_shown_without_the_ceiling() -> None:
         assert len(points) == len(labels) > 0
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="one process elsewhere")
 def test_pictures_have_the_same_bytes_with_any_number_of_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = set[bytes]()

@@ -74,6 +74,7 @@ def _page(run: FinishedRun, plots: dict[str, str]) -> str:
     return page(run, plots, top="", gallery="", about={})
 
 
+@pytest.mark.long
 def test_a_map_from_above_is_on_the_page(scored: Path, tmp_path: Path) -> None:
     assert "Map in top view" not in scored.read_text()
     folder = shutil.copytree(scored.parent, tmp_path / "run")
@@ -125,6 +126,7 @@ def test_all_plots_are_in_the_frame_of_the_run(tmp_path: Path) -> None:
     np.testing.assert_allclose(truth.poses[:, :3, 3], run.reference.T_world_lidar[:, :3, 3], atol=0.05)
 
 
+@pytest.mark.long
 def test_kiss_icp_alone_is_drawn_and_scored_beside_the_repaired_odometry(tmp_path: Path) -> None:
     made = make_run(tmp_path / "run")
     off = made.result.odometry.T_world_lidar.copy()
@@ -152,6 +154,7 @@ def test_poses_of_kiss_icp_alone_of_other_scans_are_refused(tmp_path: Path) -> N
         read_run(made.folder)
 
 
+@pytest.mark.long
 def test_without_truth_nothing_is_compared_with_it(tmp_path: Path) -> None:
     html = write_report(make_run(tmp_path / "run", with_truth=False).folder).read_text()
     plots = _plots(html)
@@ -188,6 +191,7 @@ def test_names_are_not_taken_for_markup(tmp_path: Path) -> None:
     assert "<script>" not in _page(replace(run, dataset="<script>alert(1)</script>"), {"<script>": "<svg/>"})
 
 
+@pytest.mark.long
 def test_same_run_gives_the_same_page(scored: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(scored.parent, tmp_path / "run")
     assert write_report(folder).read_text() == scored.read_text()
@@ -201,6 +205,7 @@ def test_run_without_loops_is_drawn(tmp_path: Path) -> None:
     assert "accepted" not in _plots(html)["Loops"]
 
 
+@pytest.mark.long
 def test_folder_that_cannot_be_written_to_is_named(tmp_path: Path) -> None:
     folder = make_run(tmp_path / "run").folder
     (folder / "report.html").mkdir()
@@ -226,6 +231,7 @@ def test_command_writes_the_page_and_prints_its_path(tmp_path: Path, capsys: pyt
     assert (folder / "report.html").stat().st_size > 10_000
 
 
+@pytest.mark.long
 def test_conditions_name_when_where_and_how_the_run_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["/usr/bin/segslam", "map", "my_drive"])
     html = write_report(make_run(tmp_path / "run").folder).read_text()

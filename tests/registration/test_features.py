@@ -97,6 +97,7 @@ def test_key_points_on_a_line_are_finite() -> None:
     assert all(np.isfinite(column).all() for column in features)
 
 
+@pytest.mark.long
 def test_of_a_crowded_class_the_nearest_points_are_described() -> None:
     points = np.random.default_rng(0).uniform(-50, 50, (2_000_000, 3)).astype(np.float32)
     assert len(voxel_means(points, CONFIG.feature_voxel_m)) > MAX_CLOUD_POINTS

@@ -36,6 +36,7 @@ def _without_figures(folder: Path) -> None:
     (folder / "metrics.json").unlink()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("make", "complaint"),
     [

@@ -28,7 +28,7 @@ from segslam.scans import open_dataset
 from segslam.slam.adjustment import submaps
 from segslam.slam.slam import Slam
 
-pytestmark = pytest.mark.usefixtures("short_runs")
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("short_runs")]
 SETTINGS = ("adjustment.max_minutes=0",)
 
 

@@ -229,6 +229,7 @@ def test_scans_are_mapped_as_they_appear_until_none_comes(tmp_path: Path) -> Non
     assert (run / "report.html").is_file()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
 def test_a_signal_ends_a_live_run_with_all_its_results(tmp_path: Path, number: int) -> None:
     folder, run = tmp_path / "scans", tmp_path / "run"

@@ -219,6 +219,7 @@ def _spawned(pid: int) -> list[int]:
     return [int(child) for child in children if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()]
 
 
+@pytest.mark.long
 def test_a_front_process_that_is_killed_while_it_stops_ends_the_run() -> None:
     with Front(HangingSource(), dict.fromkeys(PRESETS, Config()), tell=lambda text: None) as front:
         front.wait_until_ready()
@@ -229,6 +230,7 @@ def test_a_front_process_that_is_killed_while_it_stops_ends_the_run() -> None:
     assert front.num_restarts == 0
 
 
+@pytest.mark.long
 def test_an_exception_in_the_main_process_ends_the_front_process_at_once() -> None:
     errors: list[threading.ExceptHookArgs] = []
     before, threading.excepthook = threading.excepthook, errors.append

@@ -50,6 +50,7 @@ def test_scans_of_a_second_round_are_found_under_any_yaw(run: Path) -> None:
         assert geometry.angle(apart) < np.radians(2.0)
 
 
+@pytest.mark.long
 def test_a_scan_of_another_town_is_not_found(run: Path) -> None:
     locator = Locator.from_run(run)
     for sweep in round_sweeps(seed=8, only={10, 40}):
@@ -89,6 +90,7 @@ def test_a_damaged_log_is_refused_by_name(run: Path, tmp_path: Path) -> None:
         Locator.from_run(damaged)
 
 
+@pytest.mark.long
 def test_the_command_prints_a_pose_a_scan_and_fails_where_it_finds_none(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -15,6 +15,7 @@ from segslam.run.live.front import Front
 from segslam.scans.presets import preset
 
 
+@pytest.mark.long
 def test_the_first_scan_with_a_pose_chooses_the_preset_of_a_live_run() -> None:
     with Front(NearSource(), live_configs("auto", Settings()), tell=print) as front:
         front.wait_until_ready()

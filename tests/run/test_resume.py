@@ -155,6 +155,7 @@ def _head_of_log(tmp_path: Path, whole: Path) -> bytes:
         return (tmp_path / "head.mcap").read_bytes()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "part",
     [

@@ -23,7 +23,7 @@ from segslam.gnss import enu_from_geodetic
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.log import read_log
 
-pytestmark = pytest.mark.usefixtures("short_runs")
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("short_runs")]
 
 UNADJUSTED = load_config(None, ["adjustment.max_minutes=0"])
 """Of a single day; both are adjusted together."""

@@ -59,6 +59,7 @@ def test_keyframes_that_were_skipped_are_searched_by_appearance_at_the_end() -> 
     assert result.errors(round_drive()[1])["ate_m"] < 0.6
 
 
+@pytest.mark.long
 def test_each_pair_has_the_last_of_its_outcomes() -> None:
     result, tried = mapped_and_tried(FAR_DEG)
     pairs = [(one.candidate.source_id, one.candidate.target_id) for one in result.attempts]
@@ -74,6 +75,7 @@ def test_each_pair_has_the_last_of_its_outcomes() -> None:
     assert {(one.candidate.source_id, one.candidate.target_id) for one in late} <= set(pairs)
 
 
+@pytest.mark.long
 def test_a_drive_whose_odometry_is_far_off_closes_by_place_recognition() -> None:
     truth = round_drive()[1]
     blind = mapped(FAR_DEG, "retrieval.enabled=false")
@@ -110,6 +112,7 @@ def test_a_drive_whose_odometry_is_good_closes_by_proximity_as_before() -> None:
     np.testing.assert_array_equal(before.trajectory.T_world_lidar, after.trajectory.T_world_lidar)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("probability", "least", "most"), [(0.9995, 0, 0), (0.99, 2, 4)])
 def test_a_near_loop_that_is_less_probable_than_the_user_accepts_waits_for_two_others(
     probability: float, least: int, most: int, monkeypatch: pytest.MonkeyPatch
@@ -161,6 +164,7 @@ def carried() -> tuple[SlamResult, list[LoopAttempt]]:
     return slam.finish(), tried
 
 
+@pytest.mark.long
 def test_a_sensor_that_was_carried_to_an_older_place_is_found_there() -> None:
     (result, _), truth = carried(), round_drive()[1]
     assert [motion.is_break for motion in result.motions].index(True) == BEFORE

@@ -53,6 +53,7 @@ def error_m(made: PoseGraph) -> float:
     return geometry.distance(geometry.inverse(T_TRUE[0]) @ T_TRUE[-1] @ geometry.inverse(T_first_last))
 
 
+@pytest.mark.long
 def test_submaps_straighten_a_bent_drive_and_its_surfaces_become_thinner() -> None:
     before = error_m(graph())
     made, found = straightened()
@@ -75,6 +76,7 @@ def test_low_beams_are_measured_and_do_not_bend_the_drive() -> None:
     assert error_m(made) < 0.05
 
 
+@pytest.mark.long
 def test_an_adjustment_after_which_surfaces_are_thicker_is_dropped(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -87,6 +89,7 @@ def test_an_adjustment_after_which_surfaces_are_thicker_is_dropped(
     assert "surfaces of the map were thinner before the adjustment" in caplog.text
 
 
+@pytest.mark.long
 def test_the_adjustment_is_the_same_on_any_number_of_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2})
     monkeypatch.setattr(threading, "active_count", lambda: 1)  # those of pytest do not matter here

@@ -54,6 +54,7 @@ def test_repeating_the_steps_gives_the_same_attempts_and_poses(run: tuple[list[S
     assert [[_outcome(attempt.outcome) for attempt in step.attempts] for step in again] == outcomes
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("max_waiting", "slow"),
     [(1, "tracking"), *(pytest.param(8, one, marks=pytest.mark.slow) for one in ("closing", "neither"))],
@@ -84,6 +85,7 @@ def test_steps_do_not_depend_on_how_far_tracking_is_ahead(
     np.testing.assert_array_equal(slam.finish().trajectory.T_world_lidar, result.trajectory.T_world_lidar)
 
 
+@pytest.mark.long
 def test_a_smaller_share_of_false_loops_on_the_same_steps_reject_what_was_accepted(
     run: tuple[list[Step], SlamResult],
 ) -> None:

@@ -51,6 +51,7 @@ def measured(seconds: float, from_deg: float = 180.0, velocities: Velocities | N
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("seconds", "from_deg"), [(-0.1, 180.0), pytest.param(0.05, 90.0, marks=pytest.mark.long)])
 def test_the_duration_and_the_side_of_a_sweep_are_measured(seconds: float, from_deg: float) -> None:
     found = measured(seconds, from_deg)
@@ -64,6 +65,7 @@ def test_scans_at_one_time_have_no_sweep() -> None:
     assert measured(0.0) is None
 
 
+@pytest.mark.long
 def test_a_sensor_that_stands_and_a_short_drive_show_no_sweep() -> None:
     assert measured(-0.1, velocities=Velocities(np.zeros((NUM, 6)), INTERVAL_S)) is None
     few = Velocities(drive().per_second[:12], INTERVAL_S)
@@ -71,6 +73,7 @@ def test_a_sensor_that_stands_and_a_short_drive_show_no_sweep() -> None:
     assert measure_sweep(raw.__getitem__, T_TRUE[:12], STEP_M * np.arange(12), few, config=CONFIG) is None
 
 
+@pytest.mark.long
 def test_no_sweep_is_longer_than_the_time_between_scans() -> None:
     assert measured(-0.1, velocities=Velocities(drive().per_second, 0.06)) is None
 

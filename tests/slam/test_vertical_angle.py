@@ -64,6 +64,7 @@ def test_keyframes_farther_apart_than_a_pair_give_no_angle() -> None:
     assert measured(50.0 * np.arange(40)) is None
 
 
+@pytest.mark.long
 def test_a_drive_with_a_break_shows_the_angle_too() -> None:
     places_m = np.arange(-44.0, 45.0, 2.0)
     travel_m = places_m + 44.0 + np.where(places_m > 0.0, BREAK_TRAVEL_M, 0.0)
@@ -78,6 +79,7 @@ def test_a_drive_with_a_break_shows_the_angle_too() -> None:
     assert found.angle_deg == pytest.approx(LOW_DEG, abs=0.04)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("near_deg", [0.12, 0.3])
 def test_the_angle_does_not_depend_on_the_correction_that_is_tried_first(near_deg: float) -> None:
     places_m = np.arange(-30.0, 31.0, 2.0)
@@ -99,6 +101,7 @@ def test_a_small_angle_is_as_uncertain_as_a_large_one() -> None:
     assert small.correction_deg == 0.0
 
 
+@pytest.mark.long
 def test_a_gap_in_the_drive_is_passed_over() -> None:
     places_m = np.concatenate([np.arange(-30.0, 0.0, 2.0), np.arange(15.0, 45.0, 2.0)])
     found = measured(places_m)

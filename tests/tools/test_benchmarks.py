@@ -28,6 +28,7 @@ from tools.benchmarks import (
     labels,
     live,
     locate,
+    motions,
     odometry,
     peers,
     real,
@@ -114,6 +115,7 @@ def test_labels_without_a_correct_registration_have_tables() -> None:
     assert "0.0 % of 2" in labels.tables(results)
 
 
+@pytest.mark.long
 def test_back_end_keeps_true_closures_and_lowers_the_error(call: Call, tmp_path: Path) -> None:
     folder = tmp_path / "kitti" / "sequences" / "00"
     folder.mkdir(parents=True)
@@ -160,6 +162,24 @@ def test_real_shows_where_true_poses_contradict_the_scans(mapped: Path, monkeypa
     assert wrong["thickness_at_loops_true_m"] > 0.04
 
 
+def test_motions_tells_a_wrong_truth_from_a_wrong_pose(
+    call: Call, mapped: Path, data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three motions: the run and the truth are right; the truth is wrong by 0.3 m; the run is."""
+    reference = read_run(mapped).reference
+    assert reference is not None
+    T_wrong = geometry.transform(np.eye(3), np.array([0.3, 0.0, 0.0]))
+    covariance = np.diag(geometry.tangent(rotation_rad=0.01, translation_m=0.03) ** 2)
+    made = []
+    for row, (of_run, of_truth) in enumerate([(np.eye(4), np.eye(4)), (np.eye(4), T_wrong), (T_wrong, np.eye(4))]):
+        T_right = geometry.inverse(reference.T_world_lidar[row]) @ reference.T_world_lidar[row + 1]
+        made.append(real.ComparedMotion((row, row + 1), T_right @ of_run, T_right @ of_truth, covariance))
+    monkeypatch.setattr(motions, "compared_motions", lambda _: made)
+    found = call(motions, data, mapped)
+    assert (found["motions"], found["outside"]) == (3, 2)
+    assert (found["measured_again_as_in_the_run"], found["as_the_true_one"], found["as_neither"]) == (1, 1, 0)
+
+
 def test_peers_reads_the_poses_and_closures_of_the_other_program(call: Call, tmp_path: Path) -> None:
     made = make_run(tmp_path / "work" / "segslam_scans")
     (tmp_path / "scans").mkdir()
@@ -202,6 +222,7 @@ def test_map_counts_what_moves_and_what_stands(call: Call, mapped: Path, data: P
     assert figures["standing_lost_percent"] < 5.0
 
 
+@pytest.mark.long
 def test_odometry_compares_voxel_sizes_and_another_library(call: Call, data: Path) -> None:
     rows = call(odometry, data, "--sequence", "00", "--voxels", "1,2")["rows"]
     assert [row["odometry"] for row in rows] == ["KISS-ICP, 1 m", "KISS-ICP, 2 m", "small_gicp VGICP"]
@@ -224,6 +245,7 @@ def test_scenes_judges_true_and_false_pairs(call: Call) -> None:
     assert sum(row["rejected"].values()) + row["false_accepted"] <= 2
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_submaps_of_a_real_drive_are_registered(
     data_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -236,6 +258,7 @@ def test_submaps_of_a_real_drive_are_registered(
     assert "wrong" not in false
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_recognition_searches_the_older_places(
     data_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -246,6 +269,7 @@ def test_recognition_searches_the_older_places(
     assert figures["queries"] == sum(figures["outcomes"].values()) == 2
 
 
+@pytest.mark.long
 @pytest.mark.data
 @pytest.mark.usefixtures("one_pair")
 def test_registration_aligns_real_pairs(call: Call, data_dir: Path, tmp_path: Path) -> None:
@@ -270,6 +294,7 @@ def test_every_part_of_registration_makes_its_tables(call: Call, data_dir: Path,
     assert all(tables.values())
 
 
+@pytest.mark.long
 @pytest.mark.data
 @pytest.mark.usefixtures("one_pair")
 def test_labels_by_shape_agree_with_the_truth_and_align_real_pairs(

@@ -119,6 +119,7 @@ def _is_wrong(found: Alignment | Rejected) -> bool:
     return geometry.distance(T) > 0.5 or geometry.angle(T) > math.radians(2.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("scene", "sensor", "noise_m", "kept"),
     [("corridor", "64", 0.03, 0.7), ("garage", "16", 0.01, 0.7), ("parking lot", "non-repeating", 0.03, 0.5)],

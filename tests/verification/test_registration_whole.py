@@ -51,6 +51,7 @@ def test_one_thread_and_two_give_the_same_bits(tmp_path: Path) -> None:
     assert _digest(tmp_path / "scans.npz", 1) == _digest(tmp_path / "scans.npz", 2)
 
 
+@pytest.mark.long
 def test_two_million_points_are_registered() -> None:
     """Each point of two scans, many times over with noise."""
     scans, _ = round_drive()

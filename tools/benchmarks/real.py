@@ -12,7 +12,7 @@ import json
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -20,7 +20,7 @@ from scipy.stats import chi2
 from segslam.core import geometry
 from segslam.core.evaluation import align_positions
 from segslam.core.trajectory import rows_of_same_scan
-from segslam.core.types import Points, Trajectory
+from segslam.core.types import Information, Points, Trajectory, Transform
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import LOG
 from segslam.output.log import read_log
@@ -55,19 +55,39 @@ def row(name: str, runs: list[FinishedRun]) -> common.Row:
     return found
 
 
-def within_covariance(run: FinishedRun) -> common.Row:
-    """How true the covariances of the motions are: compared with their errors by the true poses."""
+class ComparedMotion(NamedTuple):
+    """A motion of a run, with its covariance, and the true one."""
+
+    scans: tuple[int, int]
+    """Indices of the two scans."""
+    T_found: Transform
+    T_true: Transform
+    covariance: Information
+
+    def off(self, T_one: Transform, T_other: Transform) -> float:
+        """Chi-square of the difference between two measurements of it."""
+        error = geometry.log(geometry.inverse(T_one) @ T_other)
+        return float(error @ np.linalg.solve(self.covariance, error))
+
+
+def compared_motions(run: FinishedRun) -> list[ComparedMotion]:
+    """The motions of a run that have a covariance of their own, between scans of which the true poses are known."""
     assert run.reference is not None
     rows = rows_of_same_scan(run.result.trajectory.scan_index, run.reference.scan_index)
     true_row = dict(rows.tolist())
-    squares = []
+    found = []
     for row, (last, step) in enumerate(pairwise(read_log(run.folder / LOG).steps()), start=1):
         covariance = None if step.motion is None else step.motion.covariance
         if covariance is not None and row in true_row and row - 1 in true_row:
             T_a, T_b = (run.reference.T_world_lidar[true_row[k]] for k in (row - 1, row))
             T_true, T_found = (geometry.inverse(a) @ b for a, b in ((T_a, T_b), (last.T_odom_lidar, step.T_odom_lidar)))
-            error = geometry.log(geometry.inverse(T_true) @ T_found)
-            squares.append(error @ np.linalg.solve(covariance, error))
+            found.append(ComparedMotion((last.scan_index, step.scan_index), T_found, T_true, covariance))
+    return found
+
+
+def within_covariance(run: FinishedRun) -> common.Row:
+    """How true the covariances of the motions are: compared with their errors by the true poses."""
+    squares = [motion.off(motion.T_true, motion.T_found) for motion in compared_motions(run)]
     if not squares:
         return {}
     return {

@@ -13,6 +13,7 @@ from segslam.core.evaluation import Up, align_positions
 from segslam.core.trajectory import Poses, rows_of_same_scan
 from segslam.core.types import SegslamError
 from segslam.core.whole_files import check_target, whole_file
+from segslam.output.accuracy import AFTER, Align, aligned_by
 from segslam.output.finished import FinishedRun
 from segslam.output.report import figures
 
@@ -29,16 +30,16 @@ def check_picture(file: Path) -> None:
     check_target(file)
 
 
-def draw_scored(file: Path, estimate: Poses, reference: Poses, *, up: Up = "z") -> None:
+def draw_scored(file: Path, estimate: Poses, reference: Poses, *, align: Align = "se3", up: Up = "z") -> None:
     """Draw matched poses in top view, aligned, and the error against travel; `up`: upward axis of the reference."""
-    aligned = align_positions(estimate[:, :3, 3], reference[:, :3, 3]) @ estimate
+    aligned = aligned_by(estimate, reference, align)
     with matplotlib.rc_context(figures.STYLE):
         figure = Figure(figsize=(12.8, 6.0), layout="constrained")
         above, error = figure.subplots(1, 2)
         _plot_above(above, "reference", reference, figures.TRUTH, width=4.0, up=up)
         _plot_above(above, "estimate", aligned, COLORS[0], up=up)
         figures.plot_error(error, "estimate", aligned, reference, COLORS[0])
-        _finish(figure, [above], error, file, up=up)
+        _finish(figure, [above], error, file, error_of=f"error {AFTER[align]}", up=up)
 
 
 def draw_runs(file: Path, runs: Mapping[str, FinishedRun]) -> None:
@@ -56,7 +57,8 @@ def draw_runs(file: Path, runs: Mapping[str, FinishedRun]) -> None:
             _plot_group(axes, error, {name: runs[name] for name in names}, colors)
             if len(groups) > 1:
                 axes.set_title(runs[names[0]].dataset or names[0], loc="right", fontsize=10)
-        _finish(figure, above, error, file, error_of="error" if all(has_truth) else "distance from truth or first run")
+        compared = "error" if all(has_truth) else "distance from truth or first run"
+        _finish(figure, above, error, file, error_of=f"{compared} {AFTER['se3']}")
 
 
 def by_data(runs: Mapping[str, FinishedRun]) -> list[list[str]]:
@@ -102,13 +104,11 @@ def _plot_above(axes: Axes, name: str, poses: Poses, color: str, *, width: float
     axes.plot(*poses[:, ACROSS[up], 3].T, color=color, label=name, linewidth=width)
 
 
-def _finish(
-    figure: Figure, above: Sequence[Axes], error: Axes, file: Path, *, error_of: str = "error", up: Up = "z"
-) -> None:
+def _finish(figure: Figure, above: Sequence[Axes], error: Axes, file: Path, *, error_of: str, up: Up = "z") -> None:
     right, ahead = ("xyz"[axis] for axis in ACROSS[up])
     for axes in above:
         axes.set(xlabel=f"{right} (m)", ylabel=f"{ahead} (m)", aspect="equal", adjustable="datalim")
-    error.set(xlabel="distance travelled (m)", ylabel=f"{error_of} after alignment (m)")
+    error.set(xlabel="distance travelled (m)", ylabel=f"{error_of} (m)")
     error.set_ylim(bottom=0)
     for axes in (*above, error):
         figures.legend_on_top(axes, num_columns=2)

@@ -16,6 +16,7 @@ from segslam.output.log import LogWriter, read_log, schema
 from segslam.output.log.writer import Output
 
 
+@pytest.mark.long
 def test_a_cut_log_gives_every_complete_step_wherever_it_is_cut(
     steps: list[Step], whole: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -23,6 +23,7 @@ from segslam.output.log.drawing import MAP_RANGE_M, REJECTED_COLORS, Drawing, we
 from segslam.output.log.records import BULK, codec
 
 
+@pytest.mark.long
 def test_own_messages_agree_with_the_json_schemas_in_the_file(steps: list[Step], tmp_path: Path) -> None:
     estimate, trajectory = made_result(steps)
     with LogWriter(tmp_path / "log.mcap", config=CONFIG, reference=trajectory) as log:
@@ -165,6 +166,7 @@ def test_closures_turn_from_red_to_green_with_their_weight() -> None:
     assert weight_color(1.0).startswith("#00ff")
 
 
+@pytest.mark.long
 def test_all_versions_of_the_odometry_path_together_stay_linear_in_its_length(tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", list(made_steps(800)))
     lengths = [len(message.poses) for message in decoded(path, schema.ODOMETRY)]

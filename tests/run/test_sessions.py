@@ -84,6 +84,8 @@ def test_two_days_become_one_frame(days: Days, merged: FinishedRun) -> None:
     assert distance_m.max() < 0.3
     assert angle_deg.max() < 1.0
     assert merged.metrics["num_sessions"] == 2
+    lengths_m = [day.metrics["length_m"] for day in (days.monday, days.friday)]
+    assert merged.metrics["length_m"] == pytest.approx(sum(lengths_m), rel=0.02), "without the way between them"
     assert merged.metrics["num_loops_between"] >= 3
     assert merged.metrics["num_loops_false"] == 0
     assert merged.metrics["num_motions_broken"] == 0

@@ -13,6 +13,7 @@ import numpy as np
 from segslam.candidates.proximity import BREAK_STEP_M
 from segslam.core import geometry
 from segslam.core.config import Config
+from segslam.core.trajectory import travelled_m
 from segslam.core.types import REJECTED_WEIGHT, LoopAttempt, SegslamError, Step, Trajectory
 from segslam.gnss import Use
 from segslam.gnss.fixes import Row
@@ -124,15 +125,18 @@ class Merged:
         return georeference_if_possible(folder, source, rows, use=use) if rows else ""
 
     def figures(self, result: SlamResult) -> dict[str, Any]:
-        """The figures of `metrics.json` that only merged runs have."""
+        """The figures of `metrics.json` that only merged runs have, and their length without that between sessions."""
         first_ids = [session.shift.keyframe_id for session in self.sessions[1:]]
         between = [
             weight
             for ids, weight in result.estimate.closure_weights.items()
             if len(set(np.searchsorted(first_ids, ids, side="right").tolist())) > 1
         ]
+        ends = np.cumsum([len(session.run.result.trajectory) for session in self.sessions])
+        drives = np.split(result.trajectory.T_world_lidar, ends[:-1])
         return {
             "num_sessions": len(self.sessions),
+            "length_m": sum(float(travelled_m(drive)[-1]) for drive in drives),
             "num_loops_between": len(between),
             "num_loops_between_switched_off": sum(weight < REJECTED_WEIGHT for weight in between),
         }

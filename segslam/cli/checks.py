@@ -1,5 +1,6 @@
 """Checks before a command begins: its input exists, a run can be resumed, nothing is replaced unasked; presets."""
 
+import os
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -39,6 +40,12 @@ def check_free(files: Iterable[Path | None], *, overwrite: bool) -> None:
         check_target(file)
         if file.is_file() and not overwrite:
             raise SegslamError(f"{file}: exists; give another name, or replace it with --overwrite")
+
+
+def outside(files: Iterable[Path], folder: Path) -> list[Path]:
+    """The files that are not in a folder, in full and without `..`."""
+    whole = [Path(os.path.abspath(file)) for file in files]  # resolve() would follow links
+    return [file for file in whole if Path(os.path.abspath(folder)) not in file.parents]
 
 
 def check_own(folder: Path, *made_by: str) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.checks import check_exists, check_free, live_configs, make_folder, show_preset
+from segslam.cli.checks import check_exists, check_free, live_configs, make_folder, outside, show_preset
 from segslam.cli.console import Terminal, how_to_go_on
 from segslam.cli.ending import counted, finish
 from segslam.cli.options import GnssOptions, PresetOption, RunOutput
@@ -82,7 +82,7 @@ def live(
     from segslam.slam.slam import Slam
 
     map_names, map_files = output.maps(out)
-    check_free([file for file in map_files if out not in file.parents], overwrite=output.overwrite)
+    check_free(outside(map_files, out), overwrite=output.overwrite)
     settings = configs["driving"]  # the presets differ in none of the values used here
     angle_deg = settings.sensor.vertical_angle_deg or 0.0
     source = _source(folder, topic, intensities=settings.map.color == "intensity", vertical_angle_deg=angle_deg)

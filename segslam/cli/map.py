@@ -18,6 +18,7 @@ from segslam.cli.checks import (
     is_finished,
     log_to_resume,
     make_folder,
+    outside,
     preset_config,
 )
 from segslam.cli.console import Terminal, how_to_go_on, print_json, say
@@ -172,7 +173,7 @@ def map_data(
     from segslam.run.map_folder import given_odometry, in_effect, open_scans, resume_options
 
     map_names, map_files = output.maps(folder)
-    check_free([file for file in map_files if folder not in file.parents], overwrite=output.overwrite or options.resume)
+    check_free(outside(map_files, folder), overwrite=output.overwrite or options.resume)
     source = options.source(data, options.labels, options.encoding)
     scans = open_scans(source, settings)
     if settings.map.color == "intensity":

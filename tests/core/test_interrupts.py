@@ -155,6 +155,10 @@ def test_the_folder_of_a_map_file_is_made_or_refused_before_mapping(
     assert run(*command, "--map-file", tmp_path / "nowhere" / "x.ply") == 2
     assert "there is no folder" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+    (tmp_path / "kept.ply").write_text("another map")
+    assert run(*command, "--map-file", "../kept.ply") == 2, "outside the folder of the run"
+    assert "kept.ply: exists" in capsys.readouterr().err
+    assert (tmp_path / "kept.ply").read_text() == "another map"
     assert run(*command, "--map-file", "sub/x.ply") == 0
     assert (tmp_path / "run" / "sub" / "x.ply").is_file()
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from segslam.slam.slam_result import SlamResult
 
 TROUBLE = (
-    ("num_scans_skipped", "scan", "{} skipped (unreadable or empty); see the warning above"),
+    ("num_scans_skipped", "scan", "{} skipped (unreadable, empty or without a pose); see the warning above"),
     ("num_motions_repaired", "motion", "odometry: {} repaired by registration with earlier scans"),
     ("num_motions_broken", "break", "odometry: {}, i.e. motions not supported by the scans; see the report"),
     (

@@ -105,6 +105,7 @@ class RunSettings(Settings):
     refine_minutes: Annotated[
         float | None,
         typer.Option(
+            min=0,
             metavar="MINUTES",
             help="Time limit of the adjustment of the whole map after the loops; 60 by default, 0: no adjustment.",
         ),

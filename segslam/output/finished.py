@@ -34,7 +34,7 @@ FIGURES = {
     "length_m": "length of the drive (m)",
     "duration_s": "duration of the drive (s)",
     "num_scans": "scans mapped",
-    "num_scans_skipped": "scans skipped (unreadable or empty)",
+    "num_scans_skipped": "scans skipped (unreadable, empty or without a pose)",
     "num_scans_left": "scans left when the run was stopped",
     "num_keyframes": "keyframes",
     "num_candidates": "loop candidates tried",

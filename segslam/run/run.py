@@ -113,7 +113,8 @@ class Run:
         try:
             self._log.close()
         finally:
-            (self.folder / (LOG + UNFINISHED)).unlink(missing_ok=True)
+            if self._resumes:
+                (self.folder / (LOG + UNFINISHED)).unlink(missing_ok=True)
             self._remove_unbegun()
 
     def _remove_unbegun(self) -> None:
@@ -239,7 +240,7 @@ class Run:
         """End the log, and write the files of poses, graph and loops."""
         late = result.attempts[len(result.attempts) - result.num_late_attempts :]
         self._log.write_result(result.estimate, result.trajectory, late, result.adjusted)
-        self._log.close()
+        self._log.end()  # the run is in progress until all its files are written
         with room_for(self.folder):
             write_poses(self.folder, "poses", result.trajectory, self._T_camera_lidar, among=result.localised())
             if result.from_map_m is not None:

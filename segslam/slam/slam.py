@@ -146,13 +146,13 @@ class Slam:
             self._tracker.resume(odometry.T_world_lidar, odometry.stamp_ns, scan_of)
 
     def finish(self, *, search_s: float = math.inf, progress: Progress = no_progress) -> SlamResult:
-        """Final optimisation; returns the pose of every scan. Raises ValueError before the first scan.
+        """Final optimisation; returns the pose of every scan. Raises SegslamError before the first scan.
 
         Loops are then searched again with the final poses, for at most `search_s` seconds. The adjustment of the whole
         map follows, with `progress`.
         """
         if not self._steps:
-            raise ValueError("no scan was processed")
+            raise SegslamError("no scan was processed; give at least one that can be used before `finish`")
         self._is_finished = True
         estimate, late = self._settle(monotonic() + search_s)
         self._loops.forget()

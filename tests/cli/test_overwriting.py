@@ -10,7 +10,7 @@ from helpers.finished_run import make_run
 
 from segslam.cli.checks import make_folder
 from segslam.core.errors import SegslamError
-from segslam.output.log import read_log
+from segslam.output.log import is_being_written, read_log
 from segslam.output.log.writer import Output
 
 GRAPH = """VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1
@@ -60,6 +60,20 @@ def test_the_image_of_a_grid_is_not_replaced_either(
     assert run("export", made, tmp_path / "grid.yaml", "--quiet") == 2
     assert "grid.pgm: exists" in capsys.readouterr().err
     assert (tmp_path / "grid.pgm").read_bytes() == b"mine"
+
+
+@pytest.mark.usefixtures("short_runs")
+def test_a_run_is_in_progress_until_its_report_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_kitti_sequence(tmp_path / "data", num_scans=3)
+    states = []
+    monkeypatch.setattr(
+        "segslam.output.report.write_report", lambda folder: states.append(is_being_written(folder / "log.mcap"))
+    )
+    out = tmp_path / "run"
+    assert run("map", tmp_path / "data", "--frames", "0:3", "--out", out, "--labels", "none", "--quiet") == 0
+    assert states == [True]
+    assert not is_being_written(out / "log.mcap")
+    assert read_log(out).result() is not None
 
 
 @pytest.mark.long

@@ -113,7 +113,7 @@ def test_a_bad_scan_is_forgotten() -> None:
 
 
 def test_there_is_no_end_without_a_beginning() -> None:
-    with pytest.raises(ValueError, match="no scan"):
+    with pytest.raises(SegslamError, match="no scan"):
         Slam(SLAM_CONFIG).finish()
 
 

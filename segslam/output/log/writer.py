@@ -111,6 +111,7 @@ class LogWriter:
         self._stamp_ns = 0
         self._num_poses = 0
         self._newest: Keyframe | None = None
+        self._is_ended = False
         self._steps_of_keyframes: dict[int, tuple[int, int]] = {}
         """Position in the file, and size, of the step of each keyframe."""
         try:
@@ -186,12 +187,20 @@ class LogWriter:
             raise WorkFailed(f"{path}: cannot be replaced by {self._path} ({error.strerror})") from error
         self._path = path
 
-    def close(self) -> None:
-        """Write the index. A log without index is readable, but slower to search."""
-        if not self._output.raw.closed:
+    def end(self) -> None:
+        """Write the index, once. The log is whole then, but counts as being written until `close`."""
+        if not self._is_ended:
+            self._is_ended = True
             with self._whole():
                 self._mcap.finish()
-            self._output.close()
+
+    def close(self) -> None:
+        """Write the index, and close the file. A log without index is readable, but slower to search."""
+        if not self._output.raw.closed:
+            try:
+                self.end()
+            finally:
+                self._output.close()
 
     def __enter__(self) -> "LogWriter":
         return self

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Runs the tests in a process a core until the first failure, after setting up what they need; 6 to 11 minutes on two
+# Runs the tests in a process a core until the first failure, after setting up what they need; 5 to 8 minutes on two
 # cores. Options go to pytest: `bash tools/test.sh -m slow` runs the slow ones, `--maxfail 0` does not stop at a failure,
 # `-n 0` runs all in one process.
 set -euo pipefail

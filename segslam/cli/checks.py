@@ -25,6 +25,13 @@ def check_exists(path: Path, hint: str) -> None:
         raise SegslamError(f"{path}: no such file or folder; {hint}")
 
 
+def check_scans(data: Path) -> None:
+    """Raises SegslamError if there is no such data, or if it is the folder of a run, whose map is no scan."""
+    check_exists(data, "give the folder with sequences/ or with the scans")
+    if all((data.expanduser() / name).is_file() for name in ("log.mcap", "config.yaml")):
+        raise SegslamError(f"{data}: the folder of a run; give the data that it was made from")
+
+
 def check_run(run: Path) -> None:
     """Raises SegslamError if there is no such run."""
     check_exists(run, "give a run folder, or its log.mcap")

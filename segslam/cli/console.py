@@ -38,7 +38,8 @@ class FirstOfEachKind(logging.Handler):
         """Print the number of further warnings of each kind."""
         for kind, num_warnings in self._counts.items():
             if num_warnings > 1:
-                say(f"segslam: {num_warnings - 1} more warnings like this, the last: {self._last[kind]}")
+                more = "1 more warning" if num_warnings == 2 else f"{num_warnings - 1} more warnings"
+                say(f"segslam: {more} like this, the last: {self._last[kind]}")
         self._counts.clear()
 
 

@@ -101,7 +101,7 @@ def georeference(
     check_exists(run, "give the folder of a finished run")
     terminal.announce(f"georeference: reading {run}")
     from segslam.output.folder import folder_of
-    from segslam.output.georeferenced import FILE
+    from segslam.output.georeferenced import ENU, FILE, FIXES, GEODETIC
     from segslam.output.log import read_log
     from segslam.output.report import write_report
 
@@ -116,4 +116,4 @@ def georeference(
     if terminal.json:
         print((folder / FILE).read_text(encoding="utf-8").rstrip(), flush=True)
     else:
-        terminal.say(f"{placed}\nresults in {folder}: georeference.json, gnss.csv, poses_geodetic.csv")
+        terminal.say(f"{placed}\nresults in {folder}: {', '.join((FILE, FIXES, GEODETIC, ENU))}")

@@ -9,6 +9,7 @@ import typer
 
 from segslam.cli.checks import check_free, check_links, check_run
 from segslam.cli.console import Terminal
+from segslam.cli.ending import counted
 from segslam.cli.options import LogArgument, OverwriteOption
 from segslam.cli.tables import with_meanings
 from segslam.cli.viewers import check_display, scene_in
@@ -110,8 +111,9 @@ def _lines(found: dict[str, Any]) -> str:
     """The content as text, for 80 columns."""
     from segslam.output.finished import FIGURES
 
+    num_steps = counted(found["num_steps"], "scan")
     then = f"; continue with: segslam resume {shlex.quote(found['run'])}" if found["state"] == "interrupted" else ""
-    text = [f"{found['run']}: {found['data']}, {found['state']}, {found['num_steps']} scans in the log{then}"]
+    text = [f"{found['run']}: {found['data']}, {found['state']}, {num_steps} in the log{then}"]
     text += with_meanings([found["figures"]], {key: FIGURES[key] for key in found["figures"]}).splitlines()
     for title, values in (("options", found["options"]), ("settings changed", found["changed_settings"])):
         text += [f"{title}: {'none' if not values else ''}".rstrip()]

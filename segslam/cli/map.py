@@ -15,6 +15,7 @@ from segslam.cli.checks import (
     check_intensities,
     check_preset,
     check_same,
+    check_scans,
     is_finished,
     log_to_resume,
     make_folder,
@@ -164,7 +165,7 @@ def map_data(
         check_display()
     if options.resume and output.overwrite:
         raise SegslamError("--overwrite: a resumed run is continued, not replaced; give --resume or --overwrite")
-    check_exists(data, "give the folder with sequences/ or with the scans")
+    check_scans(data)
     recorded = log_to_resume(folder) if options.resume and not dry_run else None
     check_preset(options.preset, resumes=recorded is not None)
     settings = output.load(base=recorded.config if recorded else None)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.checks import check_exists, check_own
+from segslam.cli.checks import check_own, check_scans
 from segslam.cli.console import Terminal
 from segslam.cli.options import EncodingOption, LabelsOption, Numbering, OverwriteOption, ScanOptions, Settings
 from segslam.core.errors import BadScan, SegslamError
@@ -106,7 +106,7 @@ def calibrate(
     the value of the setting that corrects it is printed as well.
     Example: segslam calibrate kitti --sequence 00 --set sensor.vertical_angle_deg=0
     """
-    check_exists(data, "give the folder with sequences/ or with the scans")
+    check_scans(data)
     settings = changes.load()
     terminal.announce(f"calibrate: opening {data}")
     from segslam.slam.adjustment.vertical_angle import Calibrator

@@ -40,6 +40,15 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.parametrize("command", ["map", "calibrate"])
+def test_a_run_is_no_data(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its map.ply was mapped as a scan."""
+    folder = make_run(tmp_path / "run").folder
+    (folder / "map.ply").write_bytes(b"")
+    assert run(command, folder, *(("--out", tmp_path / "other") if command == "map" else ())) == 2
+    assert f"{folder}: the folder of a run; give the data that it was made from" in capsys.readouterr().err
+
+
 def _started(out: Path, scans: Path, **options: str) -> Path:
     """A run that was interrupted before its first step, with these options in its log."""
     out.mkdir()

@@ -47,6 +47,7 @@ def test_a_list_has_paths_relative_to_it_and_the_options_of_map(tmp_path: Path) 
         ("- {data: a, set: 3}", "drive 1: set: expected texts"),
         ("- {data: a, name: ../b}", "drive 1: name '../b': use letters"),
         ("- {data: a, topic: [1]}", "drive 1: topic: expected a text"),
+        ("- a\n- b\n- ./a", "a: given twice with the same options"),
         ("- {data: a, name: b}\n- {data: c, name: b}\n- {data: d, name: b-2}", "b-2: two drives have this name"),
         ("- [", "not valid YAML"),
     ],

@@ -54,7 +54,7 @@ def merge(
         if is_interrupted(terminal.progress(run.take(merged.steps()), merged.num_steps, "merge")):
             raise typer.Exit(EXIT_STATUS)
         files = [folder / name for name in WITH_MAP] if with_map else []
-        finish(run, terminal, map_files=files, more=merged.figures, place=merged.georeference)
+        finish(run, terminal, map_files=files, place=merged.georeference)
 
 
 def fleet(

@@ -74,6 +74,8 @@ class Replay:
         The log has the options that further replays need.
         """
         options = {"in_map": str(self.in_map)} if self.in_map else {}
+        if sessions := self.recorded.options.get("sessions"):
+            options["sessions"] = sessions
         if self.edits != NO_EDITS:
             options["edits"] = self.edits.to_json()
         return Run(

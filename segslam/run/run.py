@@ -1,5 +1,6 @@
 """A run: processes the scans of a data set, and writes the files of the run folder."""
 
+import json
 import logging
 import math
 import shlex
@@ -39,6 +40,7 @@ from segslam.output.folder import (
     write_poses,
 )
 from segslam.output.log import LogWriter, Mirror, RunLog, read_log
+from segslam.run.sessions.figures import figures_of
 from segslam.scans import Dataset
 from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.adjustment.vertical_angle import measure_vertical_angle
@@ -80,6 +82,7 @@ class Run:
         self.num_scans_skipped = 0
         self.num_scans_resumed = 0
         self._dataset = dataset
+        self._sessions = json.loads(options.get("sessions", "[]"))
         self._reference = reference
         self._resumes = resumes
         self._next_row = 0
@@ -276,6 +279,8 @@ class Run:
         result, metrics = self._finish(search_s, progress)
         if self._reference is not None:
             metrics |= accuracy(result, self._reference)
+        if self._sessions:
+            metrics |= figures_of(self._sessions, result)
         metrics |= more(result)
         write_metrics(self.folder, metrics)
         placed, failure = "", None

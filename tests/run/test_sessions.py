@@ -177,6 +177,8 @@ def test_a_merged_log_replays_and_finds_the_second_session_again(
     assert run("replay", merged.folder, "--out", tmp_path / "again", "--json", "--quiet") == 0
     metrics = json.loads(capsys.readouterr().out)
     assert metrics["num_scans"] == merged.metrics["num_scans"]
+    assert (metrics["num_sessions"], metrics["num_loops_between"] >= 3) == (2, True)
+    assert metrics["length_m"] == pytest.approx(merged.metrics["length_m"], rel=0.02)
     assert metrics["ate_m"] < 0.3
     first_id = int((days.monday.result.keyframe_rows >= 0).sum())
     steps = read_log(tmp_path / "again" / "log.mcap").steps(clouds=False)

@@ -6,15 +6,13 @@ from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice, product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from segslam.candidates.proximity import BREAK_STEP_M
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.trajectory import travelled_m
-from segslam.core.types import REJECTED_WEIGHT, LoopAttempt, SegslamError, Step, Trajectory
+from segslam.core.types import LoopAttempt, SegslamError, Step, Trajectory
 from segslam.gnss import Use
 from segslam.gnss.fixes import Row
 from segslam.output.finished import FinishedRun, read_run
@@ -27,7 +25,7 @@ from segslam.run.sessions.recorded import Session, SessionPose, Shift, known_of,
 from segslam.run.sessions.session_pose import Relation, attempt, find_session
 from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.adjustment.known import Kept, nothing_kept
-from segslam.slam.slam import Slam, SlamResult
+from segslam.slam.slam import Slam
 
 OPTIMIZE_EVERY = 25
 """Chosen: number of keyframes of a later session between two optimisations; odometry drifts little over 50 m."""
@@ -124,23 +122,6 @@ class Merged:
         use = Use.ALIGN if uses == {Use.ALIGN} else Use.FUSE
         return georeference_if_possible(folder, source, rows, use=use) if rows else ""
 
-    def figures(self, result: SlamResult) -> dict[str, Any]:
-        """The figures of `metrics.json` that only merged runs have, and their length without that between sessions."""
-        first_ids = [session.shift.keyframe_id for session in self.sessions[1:]]
-        between = [
-            weight
-            for ids, weight in result.estimate.closure_weights.items()
-            if len(set(np.searchsorted(first_ids, ids, side="right").tolist())) > 1
-        ]
-        ends = np.cumsum([len(session.run.result.trajectory) for session in self.sessions])
-        drives = np.split(result.trajectory.T_world_lidar, ends[:-1])
-        return {
-            "num_sessions": len(self.sessions),
-            "length_m": sum(float(travelled_m(drive)[-1]) for drive in drives),
-            "num_loops_between": len(between),
-            "num_loops_between_switched_off": sum(weight < REJECTED_WEIGHT for weight in between),
-        }
-
 
 def plan(
     sessions: Sequence[Session], *, config: Config, same_reference: bool = False, progress: Progress = no_progress
@@ -216,7 +197,7 @@ def write_merged(
     with merged.begun(folder, config, kept=kept) as run:
         for step in run.take(merged.steps(before)):
             on_step(step)
-        run.complete(more=merged.figures, place=merged.georeference)
+        run.complete(place=merged.georeference)
     return read_run(folder)
 
 

@@ -45,11 +45,11 @@ def main() -> None:
     run, scans = read_run(options.run), open_dataset(options.scans)
     if run.reference is None:
         raise SegslamError(f"{options.run}: the run has no true poses; map a folder with poses.txt")
-    motions = compared_motions(run)
+    motions, row_of = compared_motions(run), {int(index): row for row, index in enumerate(scans.scan_index)}
     outside = [motion for motion in motions if motion.off(motion.T_true, motion.T_found) >= MOST_OFF]
     near_run, near_truth = np.zeros(len(outside), bool), np.zeros(len(outside), bool)
     for number, motion in enumerate(outside):
-        target, source = (scans[index].points for index in motion.scans)
+        target, source = (scans[row_of[index]].points for index in motion.scans)
         T_again = registered(target, source, motion.T_true)
         near_run[number] = motion.off(motion.T_found, T_again) < MOST_OFF
         near_truth[number] = motion.off(motion.T_true, T_again) < MOST_OFF

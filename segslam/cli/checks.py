@@ -1,6 +1,5 @@
 """Checks before a command begins: its input exists, a run can be resumed, nothing is replaced unasked; presets."""
 
-import os
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -50,9 +49,9 @@ def check_free(files: Iterable[Path | None], *, overwrite: bool) -> None:
 
 
 def outside(files: Iterable[Path], folder: Path) -> list[Path]:
-    """The files that are not in a folder, in full and without `..`."""
-    whole = [Path(os.path.abspath(file)) for file in files]  # resolve() would follow links
-    return [file for file in whole if Path(os.path.abspath(folder)) not in file.parents]
+    """The files that are not in a folder, whatever `..` and links their paths have; in full."""
+    inside = folder.resolve()
+    return [file.parent.resolve() / file.name for file in files if inside not in file.resolve().parents]
 
 
 def check_own(folder: Path, *made_by: str) -> None:

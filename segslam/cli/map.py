@@ -138,11 +138,10 @@ def _map_files(names: str, run: Path, log: Path, terminal: Terminal) -> list[Pat
             f"{log}: damaged list of map files ({names[:80]}); resume with: "
             f"segslam map DATA --out {shlex.quote(str(run))} --resume"
         ) from error
-    folder = run.resolve()
-    outside = [file for file in files if folder not in (run / file).resolve().parents]
-    for file in outside:
+    left_out = [file for file in files if outside([run / file], run)]
+    for file in left_out:
         terminal.say(f"{file}: not written, because it is outside of {run}; after this: segslam export {run} {file}")
-    return [file for file in files if file not in outside]
+    return [file for file in files if file not in left_out]
 
 
 def map_data(

@@ -1,6 +1,5 @@
 """A run: processes the scans of a data set, and writes the files of the run folder."""
 
-import json
 import logging
 import math
 import shlex
@@ -40,7 +39,7 @@ from segslam.output.folder import (
     write_poses,
 )
 from segslam.output.log import LogWriter, Mirror, RunLog, read_log
-from segslam.run.sessions.figures import figures_of
+from segslam.run.sessions.figures import figures_of, parts_in
 from segslam.scans import Dataset
 from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.adjustment.vertical_angle import measure_vertical_angle
@@ -82,7 +81,6 @@ class Run:
         self.num_scans_skipped = 0
         self.num_scans_resumed = 0
         self._dataset = dataset
-        self._sessions = json.loads(options.get("sessions", "[]"))
         self._reference = reference
         self._resumes = resumes
         self._next_row = 0
@@ -93,6 +91,7 @@ class Run:
         self._started = self._started_mapping = perf_counter()
         self._stage_ms: dict[str, list[float]] = defaultdict(list)
         try:
+            self._sessions = parts_in(options.get("sessions", ""))
             write_whole(folder / "config.yaml", config_to_yaml(slam.config))
             self._log = LogWriter(
                 folder / (LOG + UNFINISHED if resumes else LOG),

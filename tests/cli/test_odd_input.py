@@ -184,6 +184,16 @@ def test_a_log_with_a_damaged_option_is_refused_by_name(
     assert "log.mcap" in line
 
 
+@pytest.mark.parametrize("value", ["{", "[1]", '[{"first_keyframe": 0}]'])
+def test_a_log_with_damaged_sessions_is_not_replayed(
+    value: str, scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = _started(tmp_path / "run", scans, sessions=value)
+    assert run("replay", folder, "--out", tmp_path / "again", "-q") == 2
+    assert "sessions of the log: " in capsys.readouterr().err
+    assert not (tmp_path / "again").exists()
+
+
 @pytest.mark.slow
 def test_a_run_from_python_is_resumed_by_the_command(scans: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"

@@ -20,7 +20,7 @@ from tools.benchmarks import common
 from tools.benchmarks.real import compared_motions
 
 VOXEL_M, REACH_M = 0.5, 1.0
-"""Of GICP: edge of the voxels of both scans, and search distance; motions are wrong by decimetres at most."""
+"""Chosen, of GICP: edge of the voxels of both scans, and search distance; true motions are off by up to 1 m."""
 MOST_OFF = float(chi2.ppf(0.99, 6))
 
 

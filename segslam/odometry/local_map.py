@@ -105,20 +105,25 @@ class LocalMap:
 
     def cloud(self, enough: int) -> Points:
         """All points of the newest scans, in the frame of the newest one: as many scans as give `enough` voxels."""
-        T_map_odom = geometry.inverse(self.T_odom_map)
         gathered, num_thinned = [], 0
         for T_odom_lidar, scan in reversed(self._whole):
-            gathered.append(geometry.apply(T_map_odom @ T_odom_lidar, scan.points.astype(np.float64)))
+            gathered.append(self._in_map(scan.points, T_odom_lidar))
             num_thinned += len(scan.thinned)
             if num_thinned >= enough:
                 break
         return np.vstack(gathered).astype(np.float32)
 
+    def _in_map(self, points: Points, T_odom_lidar: Transform) -> Points:
+        """Points of a scan in the map's frame. Those of the newest scan stay exactly the same: recorded coordinates are
+        often multiples of a millimetre, and would be rounded from the border of a voxel to either side."""
+        if T_odom_lidar is self.T_odom_map:
+            return points
+        return geometry.apply(geometry.inverse(self.T_odom_map) @ T_odom_lidar, points.astype(np.float64))
+
     def surface(self) -> refinement.Surface:
         """The surface of all scans, in the frame of the newest one; cached."""
         if self._surface is None:
-            T_map_odom = geometry.inverse(self.T_odom_map)
-            clouds = [geometry.apply(T_map_odom @ T_odom_lidar, thinned) for T_odom_lidar, thinned in self._scans]
+            clouds = [self._in_map(thinned, T_odom_lidar) for T_odom_lidar, thinned in self._scans]
             merged = clouds[0] if len(clouds) == 1 else refinement.merge_clouds(clouds, config=self._config)
             self._surface = refinement.make_surface(merged, config=self._config)
         return self._surface

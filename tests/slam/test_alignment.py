@@ -87,3 +87,16 @@ def test_submaps_are_freed_at_once_with_the_function_that_returns_them() -> None
         assert kept() is None
     finally:
         gc.enable()
+
+
+def test_points_on_the_borders_of_voxels_are_in_the_same_ones_for_poses_that_differ_by_rounding() -> None:
+    rng = np.random.default_rng(0)
+    points = (rng.integers(-40, 40, (2000, 3)) * RefineConfig().voxel_m).astype(np.float32)
+    turned = geometry.transform(geometry.yaw(1.0), [2.0, 3.0, 0.1])
+
+    def made(*, moved_m: float) -> np.ndarray:
+        T_world = np.array([turned, turned @ geometry.transform(np.eye(3), [1.03, 0.02, 0.01])])
+        T_world[:, :3, 3] += moved_m
+        return surfaces_of(lambda _: points, T_world, np.zeros(2), config=RefineConfig())(0).points
+
+    np.testing.assert_allclose(made(moved_m=1e-13), made(moved_m=0.0), atol=1e-9)

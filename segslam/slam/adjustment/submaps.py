@@ -43,7 +43,8 @@ def surfaces_of(
     """Returns the surface of a submap by the id of its keyframe, in its frame; made when needed, and kept for a while.
 
     `motion_variance`: as of `is_known`. No object here refers to itself, so that the submaps are freed at once when the
-    function is no longer needed.
+    function is no longer needed. The keyframe's own points stay exactly the same: their coordinates are often multiples
+    of a millimetre, and would be rounded from the border of a voxel to either side.
     """
 
     @lru_cache(MOST_SUBMAPS * (2 * REACH + 1))  # those of the submaps in memory
@@ -54,8 +55,8 @@ def surfaces_of(
     def submap(keyframe_id: int) -> LightSurface:
         T_keyframe_world = geometry.inverse(T_world[keyframe_id])
         near = members(keyframe_id, motion_variance, most_m=config.voxel_m)
-        points = np.vstack([geometry.apply(T_keyframe_world @ T_world[one], scan(one)) for one in near])
-        return LightSurface(voxel_means(points, config.voxel_m))
+        others = [geometry.apply(T_keyframe_world @ T_world[one], scan(one)) for one in near if one != keyframe_id]
+        return LightSurface(voxel_means(np.vstack([scan(keyframe_id), *others]), config.voxel_m))
 
     return submap
 

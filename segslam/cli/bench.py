@@ -240,6 +240,8 @@ def _read_lists(
             raise SegslamError(f"--min-m {low_m} --max-m {high_m}: give both, the smaller one first")
         name = f"cut_{low_m:g}to{high_m:g}"
         lists = [cut_pairs(reference, name=name, min_m=low_m, max_m=high_m, min_gap=options.min_gap)]
+        if len(lists[0].pairs) == 0:
+            raise SegslamError(f"--min-m {low_m:g} --max-m {high_m:g}: no two scans of the data are this far apart")
     elif default is not None:
         lists = [default]
     else:

@@ -60,6 +60,17 @@ def check_own(folder: Path, *made_by: str) -> None:
         raise SegslamError(f"{folder}: not empty, and not made by this command; give another folder")
 
 
+def check_not_read(folder: Path, inputs: Iterable[Path | None]) -> None:
+    """Raises SegslamError for an existing folder with content that is inside an input, or contains one."""
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    own = folder.resolve()
+    for path in inputs:
+        other = None if path is None or not path.exists() else path.resolve()
+        if other is not None and (own == other or own in other.parents or other in own.parents):
+            raise SegslamError(f"{folder}: inside the input {path}, or contains it; give another --out")
+
+
 def make_folder(
     folder: Path,
     *,

@@ -94,7 +94,7 @@ def live(
         stack.callback(_remove_if_empty, out)
         terminal.compile_kernels()
         go_on = f"make the results from the log: segslam replay {shlex.quote(str(out))} --out NEW"
-        when_stopped(f"the log in {out} is kept; {go_on}")
+        when_stopped("no scan was mapped, nothing was written")
         stack.enter_context(how_to_go_on(go_on))
         place = gnss.placing_live(stack)
         front = stack.enter_context(Front(source, configs, tell=terminal.say, idle_s=idle))
@@ -109,6 +109,7 @@ def live(
         slam = Slam(settings, labeller=(lambda points: unlabelled(len(points))) if labels == "none" else None)
         mirror = server.send if server else None
         run = stack.enter_context(Run(out, slam, dataset=source.name, options=recorded, mirror=mirror))
+        when_stopped(f"the log in {out} is kept; {go_on}")
         publisher = _publisher(run, stack) if folder is None else None
         figures = _follow(front, run, terminal, scene=scene, server=server, publisher=publisher)
         ended = front.ended

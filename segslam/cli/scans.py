@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.checks import check_own, check_scans
+from segslam.cli.checks import check_not_read, check_own, check_scans
 from segslam.cli.console import Terminal
 from segslam.cli.options import EncodingOption, LabelsOption, Numbering, OverwriteOption, ScanOptions, Settings
 from segslam.core.errors import BadScan, SegslamError
@@ -42,6 +42,7 @@ def label(
     Example: segslam label kitti --labels network:model.onnx --frames 0:3 --truth kitti/sequences/00/labels --out labels
     """
     check_own(out, "*.label")
+    check_not_read(out, [data, truth, Path(labels)])
     terminal.announce(f"label: opening {data}")
     from segslam.bench.labelling import Tally
     from segslam.output.folder import new_folder

@@ -34,6 +34,7 @@ REMEDIES = {
     "mcap": "; `mcap recover IN -o OUT` copies what can be read",
     "rosbag": "; after a crash, `rosbag reindex FILE` (ROS 1) or `ros2 bag reindex FOLDER` (ROS 2) makes its index",
 }
+OWN_READERS = ("generic", "mcap", "rosbag", "ouster")
 FOREIGN_ERRORS = (Exception, SystemExit)
 """Readers of other projects raise anything for damaged data; it becomes an error that names the file."""
 
@@ -154,8 +155,9 @@ def _opened(source: DataSource) -> tuple[str, Path, Any]:
     place = _scans_folder(source.data) if kind == "generic" else source.data
     printed = io.StringIO()
     try:
-        silence = contextlib.redirect_stdout(printed), contextlib.redirect_stderr(io.StringIO())
-        with silence[0], silence[1], warnings.catch_warnings():
+        is_own = kind in OWN_READERS  # whose warnings are for the user
+        quiet = contextlib.nullcontext() if is_own else contextlib.redirect_stderr(io.StringIO())
+        with contextlib.redirect_stdout(printed), quiet, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # warnings about kiss_icp's sources, which it parses to find its readers
             loader = _loader(kind, place, source.sequence, source.topic)
             num_scans = len(loader)

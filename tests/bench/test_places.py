@@ -57,6 +57,9 @@ def test_a_file_without_places_is_refused_by_name(tmp_path: Path) -> None:
     np.savez(file, columns=np.zeros((2, 3, 4), np.uint8), poses=np.zeros((2, 3, 4)))
     with pytest.raises(SegslamError, match=r"other\.npz: columns"):
         read_places(file)
+    np.save(tmp_path / "one.npy", np.zeros(3))
+    with pytest.raises(SegslamError, match=r"one\.npy: cannot read"):
+        read_places(tmp_path / "one.npy")
     file.write_bytes(b"no places")
     with pytest.raises(SegslamError, match=r"other\.npz: cannot read"):
         read_places(file)

@@ -155,6 +155,8 @@ def test_missing_scans_and_lists_are_named(data: Path, tmp_path: Path, capsys: p
     assert "scan 4 has no file" in capsys.readouterr().err
     assert run("bench", "pairs", data, *QUICK) == 2
     assert "--pairs" in capsys.readouterr().err
+    assert run("bench", "pairs", data, "--min-m", 3000, "--max-m", 5000, *QUICK) == 2
+    assert "--min-m 3000 --max-m 5000: no two scans" in capsys.readouterr().err
 
 
 def test_a_broken_scan_costs_its_pairs_alone(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,6 +1,7 @@
 """`segslam label`: files that read back as the labels, pictures in the classes' colours, scores that can fail."""
 
 import json
+import shutil
 from pathlib import Path
 
 import matplotlib.image
@@ -143,6 +144,18 @@ def test_existing_files_are_not_overwritten(drive: Path, tmp_path: Path) -> None
     (tmp_path / "000000.label").write_bytes(b"mine")
     assert run("label", drive, "--out", tmp_path, "--labels", "true_labels") == 2
     assert (tmp_path / "000000.label").read_bytes() == b"mine"
+
+
+def test_the_labels_that_are_read_are_not_overwritten(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = tmp_path / "kitti"
+    shutil.copytree(drive, root)
+    (folder,) = {file.parent for file in root.rglob("*.label")}
+    before = {file: file.read_bytes() for file in folder.iterdir()}
+    assert run("label", root, "--out", folder, "--labels", "geometric", "--overwrite") == 2
+    assert "inside the input" in capsys.readouterr().err
+    assert {file: file.read_bytes() for file in folder.iterdir()} == before
 
 
 def test_an_unreadable_scan_is_skipped_with_a_warning(

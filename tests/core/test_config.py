@@ -140,3 +140,9 @@ def test_a_value_of_set_that_is_no_yaml_is_refused_in_one_short_line(value: str)
         load_config(None, [f"odometry.max_range_m={value}"])
     assert "odometry.max_range_m" in str(refused.value)
     assert len(str(refused.value)) < 1000
+
+
+def test_a_path_may_be_text(tmp_path: Path) -> None:
+    file = tmp_path / "one.yaml"
+    file.write_text("keyframes: {distance_m: 3.0}")
+    assert load_config(str(file)).keyframes.distance_m == 3.0

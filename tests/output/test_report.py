@@ -201,7 +201,8 @@ def test_run_without_loops_is_drawn(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path / "run").folder)
     bare = replace(run, metrics={}, result=replace(run.result, attempts=()))
     html = _page(bare, {"Loops": draw_loops(bare)})
-    assert "No place was visited twice" in html
+    assert "No pair of keyframes was proposed as a loop" in html
+    assert html.count('id="words"') == 1
     assert "accepted" not in _plots(html)["Loops"]
 
 

@@ -49,7 +49,7 @@ def read_places(file: Path) -> SeenPlaces:
     try:
         with np.load(file) as stored:
             columns, poses = stored["columns"], stored["poses"].astype(np.float64)
-    except (OSError, ValueError, KeyError, BadZipFile, EOFError) as error:
+    except (OSError, ValueError, KeyError, TypeError, BadZipFile, EOFError) as error:
         raise SegslamError(f"{unreadable(file, 'places', error)}; {remedy}") from error
     is_square = columns.ndim == 3 and columns.shape[1] == columns.shape[2]
     if not is_square or columns.dtype != np.uint8 or poses.shape != (len(columns), 3, 4):

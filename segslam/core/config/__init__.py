@@ -118,13 +118,13 @@ def short(value: Any) -> str:
         return f"a {type(value).__name__} with too many digits"
 
 
-def load_config(path: Path | None = None, overrides: Sequence[str] = (), *, base: Config | None = None) -> Config:
+def load_config(path: Path | str | None = None, overrides: Sequence[str] = (), *, base: Config | None = None) -> Config:
     """The defaults, or `base`, changed by a YAML file and then by `section.key=value` texts.
 
     Raises SegslamError, naming the file and key, for unreadable YAML, unknown keys and values out of range.
     """
     values = base.model_dump(mode="json") if base else {}
-    given = _parse_yaml(read_text(path, "configuration", "give a YAML file"), str(path)) if path else {}
+    given = _parse_yaml(read_text(Path(path), "configuration", "give a YAML file"), str(path)) if path else {}
     for name, section in given.items():
         known = values.get(name)
         values[name] = known | section if isinstance(known, dict) and isinstance(section, dict) else section

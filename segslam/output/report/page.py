@@ -73,7 +73,8 @@ details { margin: .3rem 0; } summary { cursor: pointer; } details td:first-child
 def page(run: FinishedRun, plots: Mapping[str, str], *, top: str, gallery: str, about: Mapping[str, str]) -> str:
     """The page; `plots`: caption -> SVG, between the HTML `top` and `gallery`; `about`: metadata of its log."""
     name = run.folder.resolve().name
-    title = f"{run.dataset or name}: {run.metrics.get('num_scans', len(run.result.trajectory))} scans"
+    num_scans = run.metrics.get("num_scans", len(run.result.trajectory))
+    title = f"{run.dataset or name}: {num_scans} scan{'s' * (num_scans != 1)}"
     sections = [picture_section(caption, svg) for caption, svg in plots.items()]
     sections += [section("Figures", _figures(run.metrics)), section("Loop candidates", _outcomes(run))]
     sections += [section("Files", _files(run)), section("Conditions", _conditions(run, about))]
@@ -170,17 +171,15 @@ def _key(name: str) -> str:
 
 def _outcomes(run: FinishedRun) -> str:
     """How often each outcome came, with what the words of `loops.csv` mean."""
+    words = table((word, escape(meaning)) for word, meaning in WORDS.items())
+    words = f'<details id="words"><summary>What the words mean</summary>{words}</details>'
     if not run.result.attempts:
-        return "<p>No place was visited twice, according to the estimate.</p>"
+        return f"<p>No pair of keyframes was proposed as a loop.</p>{words}"
     outcomes = (attempt.outcome for attempt in run.result.attempts)
     names = Counter(outcome.reason.value if isinstance(outcome, Rejected) else "accepted" for outcome in outcomes)
     meanings = {reason.value: f'<div class="soft">{meaning}</div>' for reason, meaning in REASONS.items()}
     rows = ((f"{name.replace('_', ' ')}{meanings.get(name, '')}", count) for name, count in names.most_common())
-    words = table((word, escape(meaning)) for word, meaning in WORDS.items())
-    return (
-        table(rows, head=("", "attempts"))
-        + f'<details id="words"><summary>What the words mean</summary>{words}</details>'
-    )
+    return table(rows, head=("", "attempts")) + words
 
 
 def settings_tables(config: Config) -> str:

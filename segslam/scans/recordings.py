@@ -29,7 +29,7 @@ from segslam.scans.dataset import (
     selected_rows,
 )
 
-KIND_OF_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".pcap": "ouster"}
+KIND_OF_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "ouster"}
 REMEDIES = {
     "mcap": "; `mcap recover IN -o OUT` copies what can be read",
     "rosbag": "; after a crash, `rosbag reindex FILE` (ROS 1) or `ros2 bag reindex FOLDER` (ROS 2) makes its index",
@@ -202,6 +202,11 @@ def _kind_of(data: Path) -> str:
         return "rosbag"
     if data.is_dir() and scan_files(_scans_folder(data)):
         return "generic"
+    if parts := [*data.glob("*.db3"), *data.glob("*.mcap")]:
+        raise SegslamError(
+            f"{data}: a ROS 2 bag without metadata.yaml, as after a crash; `ros2 bag reindex {data}` makes it, or give "
+            f"its file: {parts[0]}"
+        )
     raise SegslamError(
         f"{data}: found neither sequences/ nor velodyne/ (KITTI), nor clouds (.bin .ply .pcd ...), nor a rosbag, .mcap "
         "or .pcap; give the folder that contains them, or the kind by --dataset"

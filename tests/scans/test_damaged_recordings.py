@@ -111,3 +111,12 @@ def test_a_sensor_that_cannot_exist_is_refused_without_memory_for_it(tmp_path: P
     (tmp_path / "drive.json").write_text(re.sub(rf'"{key}": \d+', f'"{key}": {value}', text))
     with pytest.raises(SegslamError, match=r"drive\.json is not the metadata of an Ouster sensor"):
         open_dataset(data)
+
+
+def test_a_ros_2_bag_that_a_crash_left_without_metadata_is_refused_with_what_makes_it(tmp_path: Path) -> None:
+    whole = open_dataset(write_bag2(tmp_path / "drive"), topic=TOPIC)
+    (tmp_path / "drive" / "metadata.yaml").unlink()
+    (file,) = (tmp_path / "drive").glob("*.db3")
+    with pytest.raises(SegslamError, match=r"drive: a ROS 2 bag without metadata\.yaml.*ros2 bag reindex .*drive\.db3"):
+        open_dataset(tmp_path / "drive")
+    np.testing.assert_array_equal(open_dataset(file, topic=TOPIC)[1].points, whole[1].points)

@@ -25,6 +25,7 @@ FILES = {
     "georeference.json": "place of the map on the globe",
     "gnss.csv": "position fixes: kept, or why not",
     "poses_geodetic.csv": "latitude, longitude, height and heading of every scan",
+    "poses_enu_tum.txt": "pose of every scan, east, north and up, TUM format",
     "loops.csv": 'all loop candidates and their outcomes (<a href="#words">words</a>)',
     "graph.g2o": "the pose graph",
     "adjusted.g2o": "all edges of the last estimate, as <code>segslam georeference</code> reads them",

@@ -64,11 +64,14 @@ def check_not_read(folder: Path, inputs: Iterable[Path | None]) -> None:
     """Raises SegslamError for an existing folder with content that is inside an input, or contains one."""
     if not folder.is_dir() or not any(folder.iterdir()):
         return
-    own = folder.resolve()
     for path in inputs:
-        other = None if path is None or not path.exists() else path.resolve()
-        if other is not None and (own == other or own in other.parents or other in own.parents):
+        if path is not None and path.exists() and (_holds(folder, path) or _holds(path, folder)):
             raise SegslamError(f"{folder}: inside the input {path}, or contains it; give another --out")
+
+
+def _holds(folder: Path, path: Path) -> bool:
+    """True if a path is a folder or lies in it, whatever links there are."""
+    return folder.resolve() in (path.resolve(), *path.resolve().parents)
 
 
 def make_folder(
@@ -91,9 +94,8 @@ def make_folder(
     logs = [folder / name for name in made_by if (folder / name).exists()]
     if not logs or folder.is_symlink():
         raise SegslamError(f"{folder}: not made by this command, so --overwrite does not remove it; give another --out")
-    inside = folder.resolve()
     for path in inputs:
-        if path is not None and inside in (path.resolve(), *path.resolve().parents):
+        if path is not None and _holds(folder, path):
             raise SegslamError(f"{folder}: contains the input {path}; give another --out")
     if any(log.is_file() and is_being_written(log) for log in logs):
         raise SegslamError(f"{folder}: the run is still in progress; stop it, or give another --out")

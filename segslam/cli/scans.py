@@ -42,7 +42,7 @@ def label(
     Example: segslam label kitti --labels network:model.onnx --frames 0:3 --truth kitti/sequences/00/labels --out labels
     """
     check_own(out, "*.label")
-    check_not_read(out, [data, truth, Path(labels)])
+    check_not_read(out, [data, truth, data / labels])
     terminal.announce(f"label: opening {data}")
     from segslam.bench.labelling import Tally
     from segslam.output.folder import new_folder

@@ -114,8 +114,11 @@ class LocalMap:
         return np.vstack(gathered).astype(np.float32)
 
     def _in_map(self, points: Points, T_odom_lidar: Transform) -> Points:
-        """Points of a scan in the map's frame. Those of the newest scan stay exactly the same: recorded coordinates are
-        often multiples of a millimetre, and would be rounded from the border of a voxel to either side."""
+        """Points of a scan in the map's frame.
+
+        Those of the newest scan stay exactly the same: recorded coordinates are often multiples of a millimetre, and
+        would be rounded from the border of a voxel to either side.
+        """
         if T_odom_lidar is self.T_odom_map:
             return points
         return geometry.apply(geometry.inverse(self.T_odom_map) @ T_odom_lidar, points.astype(np.float64))

@@ -34,7 +34,6 @@ REMEDIES = {
     "mcap": "; `mcap recover IN -o OUT` copies what can be read",
     "rosbag": "; after a crash, `rosbag reindex FILE` (ROS 1) or `ros2 bag reindex FOLDER` (ROS 2) makes its index",
 }
-OWN_READERS = ("generic", "mcap", "rosbag", "ouster")
 FOREIGN_ERRORS = (Exception, SystemExit)
 """Readers of other projects raise anything for damaged data; it becomes an error that names the file."""
 
@@ -155,9 +154,7 @@ def _opened(source: DataSource) -> tuple[str, Path, Any]:
     place = _scans_folder(source.data) if kind == "generic" else source.data
     printed = io.StringIO()
     try:
-        is_own = kind in OWN_READERS  # whose warnings are for the user
-        quiet = contextlib.nullcontext() if is_own else contextlib.redirect_stderr(io.StringIO())
-        with contextlib.redirect_stdout(printed), quiet, warnings.catch_warnings():
+        with contextlib.redirect_stdout(printed), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # warnings about kiss_icp's sources, which it parses to find its readers
             loader = _loader(kind, place, source.sequence, source.topic)
             num_scans = len(loader)
@@ -192,7 +189,8 @@ def _loader(kind: str, source: Path, sequence: str, topic: str) -> Any:
             return OusterFrames(source)
     from kiss_icp.datasets import dataset_factory
 
-    return dataset_factory(kind, source, sequence=sequence, topic=topic)
+    with contextlib.redirect_stderr(io.StringIO()):  # here alone: warnings of our own readers are for the user
+        return dataset_factory(kind, source, sequence=sequence, topic=topic)
 
 
 def _kind_of(data: Path) -> str:
@@ -202,10 +200,10 @@ def _kind_of(data: Path) -> str:
         return "rosbag"
     if data.is_dir() and scan_files(_scans_folder(data)):
         return "generic"
-    if parts := [*data.glob("*.db3"), *data.glob("*.mcap")]:
+    if files := sorted(file for suffix in ("db3", "mcap") for file in data.glob(f"*.{suffix}")):
         raise SegslamError(
-            f"{data}: a ROS 2 bag without metadata.yaml, as after a crash; `ros2 bag reindex {data}` makes it, or give "
-            f"its file: {parts[0]}"
+            f"{data}: no metadata.yaml, as after a crash; `ros2 bag reindex {data}` makes that of a ROS 2 bag; or give "
+            f"a file: {files[0]}"
         )
     raise SegslamError(
         f"{data}: found neither sequences/ nor velodyne/ (KITTI), nor clouds (.bin .ply .pcd ...), nor a rosbag, .mcap "

@@ -158,6 +158,16 @@ def test_the_labels_that_are_read_are_not_overwritten(
     assert {file: file.read_bytes() for file in folder.iterdir()} == before
 
 
+def test_labels_that_are_named_as_their_source_are_written_again(
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "geometric").mkdir()
+    (tmp_path / "geometric" / "000000.label").write_bytes(b"earlier")
+    assert run("label", drive, "--out", "geometric", "--labels", "geometric", "--overwrite") == 0
+    assert (tmp_path / "geometric" / "000000.label").read_bytes() != b"earlier"
+
+
 def test_an_unreadable_scan_is_skipped_with_a_warning(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -244,6 +244,19 @@ def test_a_signal_ends_a_live_run_with_all_its_results(tmp_path: Path, number: i
     assert (run / "report.html").is_file()
 
 
+@pytest.mark.long
+def test_two_signals_before_the_first_scan_leave_nothing_and_say_so(tmp_path: Path) -> None:
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    with LiveCommand(folder, "--out", tmp_path / "run", *SETTINGS) as command:
+        command.wait_for("waiting for scans")
+        command.signal(signal.SIGINT)
+        command.signal(signal.SIGTERM)  # two of one kind may become one
+        status, metrics = command.ended()
+    assert status in (2, 130), command.output
+    assert (metrics, "is kept" in command.output, (tmp_path / "run").exists()) == ({}, False, False)
+
+
 @pytest.mark.slow
 def test_without_a_scan_nothing_is_left_behind(tmp_path: Path) -> None:
     with LiveCommand(tmp_path, "--out", tmp_path / "run", "--idle", "0.5", "--quiet") as command:

@@ -1,5 +1,6 @@
 """Recordings of which a part is damaged: the rest is read, and what cannot be read is named."""
 
+import logging
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 from helpers.ouster_packets import NUM_COLUMNS, metadata, record
 from helpers.recorded_drive import CLOUD, TOPIC, write_bag1, write_bag2, write_mcap
 
+from segslam.cli.console import FirstOfEachKind
 from segslam.core.types import BadScan, SegslamError
 from segslam.scans import open_dataset
 from segslam.scans.messages import InOrder
@@ -117,6 +119,19 @@ def test_a_ros_2_bag_that_a_crash_left_without_metadata_is_refused_with_what_mak
     whole = open_dataset(write_bag2(tmp_path / "drive"), topic=TOPIC)
     (tmp_path / "drive" / "metadata.yaml").unlink()
     (file,) = (tmp_path / "drive").glob("*.db3")
-    with pytest.raises(SegslamError, match=r"drive: a ROS 2 bag without metadata\.yaml.*ros2 bag reindex .*drive\.db3"):
+    with pytest.raises(SegslamError, match=r"drive: no metadata\.yaml.*ros2 bag reindex .*drive\.db3"):
         open_dataset(tmp_path / "drive")
     np.testing.assert_array_equal(open_dataset(file, topic=TOPIC)[1].points, whole[1].points)
+
+
+def test_a_warning_while_a_recording_is_opened_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Standard error of foreign readers is not."""
+    data = record(tmp_path, "RNG15_RFL8_NIR8_DUAL", [np.full((NUM_COLUMNS, 2), 3000)] * 2)
+    data.write_bytes(data.read_bytes()[:-10])
+    logger, shown = logging.getLogger("segslam"), FirstOfEachKind()
+    logger.addHandler(shown)
+    try:
+        open_dataset(data)
+    finally:
+        logger.removeHandler(shown)
+    assert "the recording is cut short" in capsys.readouterr().err

@@ -172,8 +172,8 @@ def _key(name: str) -> str:
 
 def _outcomes(run: FinishedRun) -> str:
     """How often each outcome came, with what the words of `loops.csv` mean."""
-    words = table((word, escape(meaning)) for word, meaning in WORDS.items())
-    words = f'<details id="words"><summary>What the words mean</summary>{words}</details>'
+    meant = table((word, escape(meaning)) for word, meaning in WORDS.items())
+    words = f'<details id="words"><summary>What the words mean</summary>{meant}</details>'
     if not run.result.attempts:
         return f"<p>No pair of keyframes was proposed as a loop.</p>{words}"
     outcomes = (attempt.outcome for attempt in run.result.attempts)

@@ -19,6 +19,7 @@ from helpers.live_command import LiveCommand, record, write_scan
 
 from segslam.core import geometry
 from segslam.core.config import Config
+from segslam.core.interrupts import stopped_by_signals
 from segslam.core.types import BadScan, Scan, SegslamError
 from segslam.odometry.tracker import Tracked, Tracker
 from segslam.output.log import read_log
@@ -228,6 +229,25 @@ def test_a_front_process_that_is_killed_while_it_stops_ends_the_run() -> None:
         assert list(front) == []
     assert not front.ended.failed
     assert front.num_restarts == 0
+
+
+@pytest.mark.long
+def test_a_signal_that_does_not_end_a_wait_for_scans_is_heard(tmp_path: Path) -> None:
+    """Received by another thread here; one that arrives just before the wait begins has the same effect."""
+    late: list[bool] = []
+    with Front(FolderSource(tmp_path), dict.fromkeys(PRESETS, Config()), tell=lambda _: None) as front:
+        front.wait_until_ready()
+        receiver = threading.Thread(target=sleep, args=(5,), daemon=True)
+        receiver.start()
+        signalling = threading.Timer(0.5, signal.pthread_kill, (receiver.ident, signal.SIGTERM))
+        giving_up = threading.Timer(30, lambda: (late.append(True), front.stop()))
+        with stopped_by_signals(front.stop):
+            signalling.start()
+            giving_up.start()
+            assert front.wait_until_chosen() is None
+        giving_up.cancel()
+    assert late == []
+    assert front.is_stopping
 
 
 @pytest.mark.long

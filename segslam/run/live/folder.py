@@ -16,7 +16,7 @@ from typing import Any
 
 from segslam.core.errors import unreadable
 from segslam.core.types import BadScan, Scan, SegslamError
-from segslam.run.live.waiting import Source, Waiting
+from segslam.run.live.waiting import WAKE_S, Source, Waiting
 from segslam.scans.clouds import SUFFIXES, read_file
 
 IN_CLOSE_WRITE, IN_MOVED_TO = 0x8, 0x80
@@ -28,8 +28,6 @@ EVENT = struct.Struct("iIII")
 NAMES_KEPT = 1000
 """Number of names whose last content is remembered: a file that is closed again without a change is the same scan."""
 STAMP_NAME = re.compile(r"(?P<s>\d{9,10})[._-](?P<fraction>\d{1,9})|(?P<ns>\d{19})|(?P<us>\d{16})")
-WAKE_S = 0.2
-"""Longest time until a stop takes effect."""
 
 
 class FolderSource(Source):

@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
 from multiprocessing.sharedctypes import RawValue
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from threading import Thread
 from typing import Any
 
@@ -22,7 +22,7 @@ from segslam.core.memory import note_peak_of
 from segslam.core.types import SegslamError, Step
 from segslam.odometry.tracker import Tracked
 from segslam.run.live.serve import END_S, READY, Chosen, Ended, Past, Placed, serve
-from segslam.run.live.waiting import Source, Tally
+from segslam.run.live.waiting import WAKE_S, Source, Tally
 from segslam.scans.presets import Preset
 
 CLOUDS_KEPT = 20
@@ -65,25 +65,31 @@ class Front:
 
     def wait_until_ready(self) -> None:
         """Wait until arriving scans are processed. Raises SegslamError if the source cannot be opened."""
-        first = self._received.get()
+        first = self._next()
         if isinstance(first, Ended):
             raise SegslamError(first.why)
 
     def wait_until_chosen(self) -> Chosen | None:
         """Wait for the first scan with a pose; the preset that fits it, or None if the stream ends without one."""
-        while not isinstance(item := self._received.get(), Chosen):
+        while not isinstance(item := self._next(), Chosen):
             self._before_chosen.append(item)
             if isinstance(item, Ended):
                 return None
         return item
 
     def __iter__(self) -> Iterator[Placed]:
-        for item in chain(self._before_chosen, iter(self._received.get, None)):
+        for item in chain(self._before_chosen, iter(self._next, None)):
             if isinstance(item, Ended):
                 self.ended = item
                 return
             self.num_keyframes_waiting -= item.is_keyframe
             yield item
+
+    def _next(self) -> Any:
+        """The next item received. A signal that arrives just before a wait does not end the wait, so each is short."""
+        while True:
+            with suppress(Empty):
+                return self._received.get(timeout=WAKE_S)
 
     def stop(self) -> None:
         """Accept no more scans; waiting scans are still processed."""

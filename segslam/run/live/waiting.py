@@ -19,6 +19,8 @@ MOST_WAITING = 4
 """Chosen: at 10 Hz, waiting then adds at most 0.4 s to the latency."""
 END_NS = 2**62
 """Stamps are below this one, in the year 2116: 64 bits hold them also if they are shifted."""
+WAKE_S = 0.2
+"""Longest time until a stop takes effect."""
 LONG_GAP = 1.5
 """Chosen: there is a gap if stamps are farther apart than this many usual intervals."""
 LONGEST_PREDICTED = 10.0

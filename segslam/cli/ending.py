@@ -47,11 +47,11 @@ def finish(
 ) -> dict[str, Any]:
     """Complete a run, and show and return its figures; arguments as for `Run.complete`.
 
-    `stopped`: Ctrl-C ended the run, before the last scan if there is one.
+    `stopped`: Ctrl-C or SIGTERM ended the run, before the last scan if there is one.
     """
     from segslam.slam.adjustment.vertical_angle import vertical_angle_advice
 
-    terminal.say(f"{'Ctrl-C: stopped' if stopped else 'all scans read'}; final optimisation ...")
+    terminal.say(f"{'stopped' if stopped else 'all scans read'}; final optimisation ...")
     metrics, placed = run.complete(
         more=more, place=place, map_files=map_files, search_s=search_s, progress=terminal.progress
     )

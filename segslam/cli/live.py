@@ -95,7 +95,6 @@ def live(
         terminal.compile_kernels()
         go_on = f"make the results from the log: segslam replay {shlex.quote(str(out))} --out NEW"
         when_stopped("no scan was mapped, nothing was written")
-        stack.enter_context(how_to_go_on(go_on))
         place = gnss.placing_live(stack)
         front = stack.enter_context(Front(source, configs, tell=terminal.say, idle_s=idle))
         stack.enter_context(stopped_by_signals(front.stop))
@@ -110,6 +109,7 @@ def live(
         mirror = server.send if server else None
         run = stack.enter_context(Run(out, slam, dataset=source.name, options=recorded, mirror=mirror))
         when_stopped(f"the log in {out} is kept; {go_on}")
+        stack.enter_context(how_to_go_on(go_on))
         publisher = _publisher(run, stack) if folder is None else None
         figures = _follow(front, run, terminal, scene=scene, server=server, publisher=publisher)
         ended = front.ended

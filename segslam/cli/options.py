@@ -185,7 +185,8 @@ class GnssOptions:
     gnss: Annotated[
         str | None,
         typer.Option(
-            help="Position fixes: CSV, NMEA, RTKLIB .pos, a KITTI oxts folder, or a topic of the recording, as /fix.",
+            help="Position fixes: CSV, NMEA, RTKLIB .pos, a KITTI oxts folder, or a topic of the recording, as /fix; "
+            "with `live`, a topic of ROS 2.",
             metavar="FIXES",
         ),
     ] = None

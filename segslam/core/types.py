@@ -87,6 +87,12 @@ def as_points(points: ArrayLike) -> Points:
     return array[:, :3]
 
 
+def check_labels(labels: Labels | None, points: Points) -> None:
+    """Raises SegslamError unless there are no labels, or one for each point."""
+    if labels is not None and np.shape(labels) != (len(points),):
+        raise SegslamError(f"labels: {np.size(labels)} labels for {len(points)} points; give one for each")
+
+
 class Label(IntEnum):
     """SemanticKITTI learning ids; the moving classes are those of its multi-scan task."""
 

@@ -60,6 +60,8 @@ def _read_messages(recording: Path, topic: str) -> list[Row]:
     try:
         messages = read(recording, topic, kind="sensor_msgs/msg/NavSatFix", option="--gnss")
         return [row_of(messages[number][1]) for number in range(len(messages))]
+    except SegslamError:
+        raise
     except ImportError as error:
         raise SegslamError(f"{recording}: {error}") from error
     except Exception as error:  # the readers raise anything for damaged data

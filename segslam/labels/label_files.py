@@ -70,9 +70,12 @@ def open_labels(source: str, *, beside: Path, scan_names: Sequence[str], encodin
     Raises SegslamError for a folder that is missing or labels none of the scans, for files whose encoding is neither
     given nor detectable, and for a network that `open_network` rejects.
     """
+    has_files = source not in ("none", "geometric") and not source.startswith(NETWORK)
+    if encoding and not has_files:
+        raise SegslamError(f"--encoding {encoding}: only label files have one; omit it with --labels {source}")
     if source in ("none", "geometric"):
         return LabelSource(source == "geometric")
-    if source.startswith(NETWORK):
+    if not has_files:
         from segslam.labels.network import open_network
 
         return LabelSource(False, network=open_network(expanded(source.removeprefix(NETWORK))))

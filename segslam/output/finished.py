@@ -110,7 +110,8 @@ def read_run(folder: str | Path) -> FinishedRun:
     """The run of a folder, or of its log. Raises SegslamError if there is none, or it did not finish."""
     folder = folder_of(Path(folder))
     if not folder.is_dir():
-        raise SegslamError(f"{folder}: no such file or folder; give a folder made by `segslam map --out`")
+        what = "not a run" if folder.exists() else "no such file or folder"
+        raise SegslamError(f"{folder}: {what}; give a folder made by `segslam map --out`")
     log = read_log(folder)
     result = _result(log)
     return FinishedRun(

@@ -22,9 +22,9 @@ from segslam.core.types import (
     Points,
     Rejected,
     RejectReason,
-    SegslamError,
     Transform,
     as_points,
+    check_labels,
 )
 from segslam.graph import PoseGraph
 from segslam.keyframes import Submaps, downsample_keyframe
@@ -104,13 +104,12 @@ class Locator:
 
         `labels`: learning ids, one per point; without labels, geometric labels are computed. At most `max_places`, the
         most similar ones, are tried; if more than `NUM_FIRST`, also for views from points around the sensor. Raises
-        SegslamError for an array of another shape.
+        SegslamError for arrays of another shape.
         """
         started = perf_counter()
         config = self.config
         near = as_points(points)
-        if labels is not None and len(labels) != len(near):
-            raise SegslamError(f"locate: {len(labels)} labels for {len(near)} points; give one for each")
+        check_labels(labels, near)
         usable = within_range(near, config.odometry.min_range_m, config.odometry.max_range_m)
         near = near.compress(usable, axis=0)
         labels = geometric_labels(near) if labels is None else labels[usable]

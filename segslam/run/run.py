@@ -324,7 +324,7 @@ class Run:
 
     def _read(self, dataset: Dataset) -> Iterator[tuple[Scan | BadScan, Scan | BadScan | None]]:
         """Each scan, and the one after it."""
-        yield from pairwise(chain(self._scans(dataset), [None]))
+        yield from pairwise(chain(_without_late(self._scans(dataset)), [None]))
 
     def _scans(self, dataset: Dataset) -> Iterator[Scan | BadScan]:
         for row in range(self._next_row, len(dataset)):
@@ -367,6 +367,25 @@ class Run:
 
     def _note_ms(self, stage: str, seconds: float) -> None:
         self._stage_ms[stage].append(1000 * seconds)
+
+
+def _without_late(scans: Iterator[Scan | BadScan]) -> Iterator[Scan | BadScan]:
+    """The scans, but for those whose stamp alone is too late: the next scan follows the one before in time.
+
+    Otherwise all scans until that time would not be later than the previous one.
+    """
+    last_ns: float = -math.inf
+    for scan, following in pairwise(chain(scans, [None])):
+        if isinstance(scan, Scan) and isinstance(following, Scan) and last_ns < following.stamp_ns < scan.stamp_ns:
+            yield BadScan(
+                f"scan {scan.index}: its stamp {scan.stamp_ns} ns is later than that of the next scan, "
+                f"{following.stamp_ns} ns; correct the stamps"
+            )
+            continue
+        if isinstance(scan, Scan):
+            last_ns = max(last_ns, scan.stamp_ns)
+        if scan is not None:
+            yield scan
 
 
 def _other_data(log: Path, difference: str) -> SegslamError:

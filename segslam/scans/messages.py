@@ -18,6 +18,7 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 
 from segslam.core.config import parse_yaml
+from segslam.core.errors import SegslamError
 from segslam.core.extras import how_to_install
 from segslam.scans.scan_files import MAX_SCAN_BYTES
 
@@ -71,8 +72,8 @@ class InOrder(Generic[Message]):
 class BagMessages:
     """Messages of one kind, read in order. Replaces kiss_icp's reader, which ends the program for a missing topic.
 
-    Raises ValueError if the bag has no such topic, SegslamError if its metadata are damaged, ImportError if the package
-    is missing, and what rosbags raises.
+    Raises SegslamError if the bag has no such topic or its metadata are damaged, ImportError if the package is missing,
+    and what rosbags raises.
     """
 
     is_sequential = True
@@ -92,7 +93,7 @@ class BagMessages:
         self._bag.open()
         weakref.finalize(self, _close, self._bag)
         counts = {name: info.msgcount for name, info in self._bag.topics.items() if info.msgtype == kind}
-        topic = one_topic(counts, topic, kind=kind, option=option)
+        topic = one_topic(data, counts, topic, kind=kind, option=option)
         self._connections = [connection for connection in self._bag.connections if connection.topic == topic]
         stored = [file for path in files or [data] for file in ([path] if path.is_file() else path.iterdir())]
         num_bytes = sum(file.stat().st_size for file in stored if file.is_file())
@@ -123,8 +124,8 @@ class McapMessages:
     """Messages of one kind, by their order in time; replaces kiss_icp's reader, which fails with mcap-ros2-support 0.6.
 
     A message in a damaged chunk cannot be read; the others can. In a file without chunks, or without an index of their
-    messages, none after the damage can. Raises ValueError if the file has no index or no such topic, ImportError if
-    the decoding package is missing.
+    messages, none after the damage can. Raises ValueError if the file has no index, SegslamError if it has no such
+    topic, ImportError if the decoding package is missing.
     """
 
     def __init__(self, file: Path, topic: str, *, kind: str = CLOUD, option: str = "--topic") -> None:
@@ -142,7 +143,7 @@ class McapMessages:
             if any(one.schema_id not in summary.schemas for one in known):
                 raise ValueError(DAMAGED_INDEX)
             alike = [one for one in known if summary.schemas[one.schema_id].name == kind]
-            self._topic = one_topic({one.topic for one in alike}, topic, kind=kind, option=option)
+            self._topic = one_topic(file, {one.topic for one in alike}, topic, kind=kind, option=option)
             channels = {one.id: one for one in alike if one.topic == self._topic}
             counts = summary.statistics.channel_message_counts
             self._num_messages = sum(counts.get(id, 0) for id in channels)
@@ -187,12 +188,12 @@ class McapMessages:
                     yield message
 
 
-def one_topic(known: Collection[str], wanted: str, *, kind: str, option: str) -> str:
-    """The wanted topic, or the only one. Raises ValueError with the known ones."""
+def one_topic(recording: Path, known: Collection[str], wanted: str, *, kind: str, option: str) -> str:
+    """The wanted topic, or the only one. Raises SegslamError with the known ones."""
     found = [name for name in known if name == wanted or not wanted]
     if len(found) != 1:
         topics = ", ".join(f"{option} {name}" for name in sorted(known)) or "none"
-        raise ValueError(f"give one topic of type {kind}; the recording has: {topics}")
+        raise SegslamError(f"{recording}: give one topic of type {kind}; the recording has: {topics}")
     return found[0]
 
 

@@ -9,7 +9,16 @@ from numpy.typing import ArrayLike
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch, at_once
-from segslam.core.types import Alignment, Labels, Registration, Rejected, RejectReason, Transform, as_points
+from segslam.core.types import (
+    Alignment,
+    Labels,
+    Registration,
+    Rejected,
+    RejectReason,
+    Transform,
+    as_points,
+    check_labels,
+)
 from segslam.labels import geometric_labels
 from segslam.registration import refinement
 from segslam.registration.prepared import Observed, PreparedScan, prepare_scan
@@ -39,6 +48,7 @@ def register(
 
     def prepared(given: ArrayLike, labels: Labels | None) -> PreparedScan:
         points = as_points(given)
+        check_labels(labels, points)
         return prepare_scan(points, geometric_labels(points) if labels is None else labels, config=config)
 
     source, target = at_once(

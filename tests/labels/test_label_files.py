@@ -73,6 +73,12 @@ def test_labels_of_another_length_are_refused_with_both_numbers(tmp_path: Path) 
         read_labels(tmp_path / "000000.label", 3, "raw")
 
 
+@pytest.mark.parametrize("source", ["none", "geometric", "network:model.onnx"])
+def test_an_encoding_without_label_files_is_refused(tmp_path: Path, source: str) -> None:
+    with pytest.raises(SegslamError, match="only label files have one"):
+        open_labels(source, beside=tmp_path, scan_names=NAMES, encoding="learning")
+
+
 def test_truncated_labels_are_refused(tmp_path: Path) -> None:
     (tmp_path / "000000.label").write_bytes(b"12345")
     with pytest.raises(BadScan, match=r"000000\.label: 5 bytes"):

@@ -1,8 +1,10 @@
 """A run hands each scan to the odometry, with the scan after it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from helpers.drives import round_drive, write_kitti_sequence
 
 from segslam import open_dataset
@@ -10,6 +12,7 @@ from segslam.core.config import Config
 from segslam.core.types import BadScan, Scan
 from segslam.odometry.sweep import GivenOdometry
 from segslam.run.run import Run
+from segslam.scans import Dataset
 from segslam.slam.slam import Slam
 
 
@@ -29,3 +32,37 @@ def test_the_odometry_knows_the_next_scan_unless_it_is_broken(tmp_path: Path) ->
     assert [isinstance(step, BadScan) for step in steps] == [False, False, False, True, False, False]
     assert odometry.foreseen == [(1, 1.0), (2, 1.0), (5, 1.0)]
     np.testing.assert_array_equal([step.scan_index for step in steps if not isinstance(step, BadScan)], [0, 1, 2, 4, 5])
+
+
+class _Shifted(Dataset):
+    """The first scans of a drive, some with another stamp: that of their own, and intervals added to it."""
+
+    def __init__(self, shifts: dict[int, int]) -> None:
+        self.scan_index = np.arange(6)
+        self._shifts = shifts
+
+    def __getitem__(self, row: int) -> Scan:
+        scans = round_drive()[0]
+        interval_ns = scans[1].stamp_ns - scans[0].stamp_ns
+        return replace(scans[row], stamp_ns=scans[row].stamp_ns + self._shifts.get(row, 0) * interval_ns)
+
+
+@pytest.mark.parametrize(
+    ("shifts", "skipped"),
+    [
+        ({2: 10**6}, [2]),
+        ({0: 10**6}, [0]),
+        ({2: -2}, [2]),
+        ({1: 5, 3: 9}, [1, 3]),
+        ({5: 10**6}, []),  # the last one: nothing shows that it is late
+    ],
+)
+def test_a_stamp_that_is_too_late_or_too_early_loses_its_own_scan_only(
+    tmp_path: Path, shifts: dict[int, int], skipped: list[int]
+) -> None:
+    (tmp_path / "run").mkdir()
+    slam = Slam(odometry=GivenOdometry(round_drive()[1], Config().odometry))
+    with Run(tmp_path / "run", slam, dataset="made") as run:
+        steps = list(run.map(_Shifted(shifts)))
+    assert [row for row, step in enumerate(steps) if isinstance(step, BadScan)] == skipped
+    assert len(steps) == 6

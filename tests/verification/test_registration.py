@@ -9,7 +9,7 @@ from helpers.rooms import ground_and_walls
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch
-from segslam.core.types import Alignment, Label, Registration, Rejected, RejectReason
+from segslam.core.types import Alignment, Label, Registration, Rejected, RejectReason, SegslamError
 from segslam.registration import refinement, segregator
 from segslam.registration.free_space import observe_free_space
 from segslam.registration.prepared import PreparedScan, prepare_scan
@@ -57,6 +57,12 @@ def test_two_scans_of_a_place_are_aligned_from_any_yaw(turn_deg: float) -> None:
     metres, degrees = _error(T_target_source @ geometry.inverse(T_turned_source), found.fine.T_target_source)
     assert metres < 0.05
     assert degrees < 0.2
+
+
+def test_labels_of_another_number_are_refused() -> None:
+    points = round_drive()[0][0].points
+    with pytest.raises(SegslamError, match=f"3 labels for {len(points)} points"):
+        register(points, points, target_labels=np.zeros(3, np.uint8))
 
 
 def test_a_gate_rejects_a_coarse_pose_before_it_is_refined() -> None:

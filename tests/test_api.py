@@ -3,6 +3,8 @@
 import contextlib
 import io
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -138,13 +140,43 @@ def test_a_run_is_evaluated_exported_and_reported_by_public_names(made: MadeRun,
     with pytest.raises(segslam.SegslamError, match=r"give finite matrices, \(n, 4, 4\)"):
         segslam.evaluate(np.full((5, 4, 4), np.nan), made.truth.T_world_lidar)
     assert segslam.report(str(made.folder)) == made.folder / "report.html"
-    assert segslam.export(made.folder, [tmp_path / "map.ply"])["num_map_points"] > 0
+    assert segslam.export(made.folder, tmp_path / "map.ply")["num_map_points"] > 0
     assert (tmp_path / "map.ply").is_file()
 
 
 def test_odd_arguments_are_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(segslam.SegslamError, match="fleet: no drive"):
         segslam.fleet([], tmp_path / "city")
+
+
+WRONG_KINDS = {
+    "segslam.Slam('x.yaml')": "x.yaml is not a Config",
+    "segslam.Slam({})": "{} is not a Config",
+    "segslam.map_folder('.', 'run', config='x.yaml')": "x.yaml is not a Config",
+    "segslam.merge(['.'], 'run', config=5)": "5 is not a Config",
+    "segslam.merge('.', 'run')": "1 run given",
+    "segslam.register(np.ones((3, 3)), np.ones((3, 3)), config='x.yaml')": "x.yaml is not a Config",
+    "segslam.open_dataset('.', frames=5)": "frames 5: give a text, 'A:B'",
+    "segslam.fleet(['.'], 'fleet', num_workers=0)": "num_workers=0",
+    "segslam.Scan(np.ones((5, 3)), 0.5)": "stamp_ns 0.5: give integer nanoseconds",
+    "segslam.Scan(np.ones((5, 3)), 0, times=np.ones(3))": "3 times for 5 points",
+    "segslam.Scan(np.ones((5, 3)), 0, labels=np.ones(2, np.uint8))": "2 labels for 5 points",
+    "segslam.read_run('scan.bin')": "not a run",
+}
+
+
+def test_arguments_of_a_wrong_kind_are_refused_by_name(tmp_path: Path) -> None:
+    """In another process, where no test checks the types."""
+    np.ones((200, 4), "<f4").tofile(tmp_path / "scan.bin")
+    lines = ["import numpy as np", "import segslam"]
+    for call in WRONG_KINDS:
+        lines += ["try:", f"    {call}", "except segslam.SegslamError as error:", "    print(error)"]
+    script = "\n".join(lines)
+    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    complaints = done.stdout.splitlines()
+    assert [one for one, said in zip(WRONG_KINDS.values(), complaints, strict=True) if one not in said] == []
+    assert {file.name for file in tmp_path.iterdir()} == {"scan.bin"}
 
 
 @pytest.mark.long

@@ -177,8 +177,18 @@ class Scan(Record):
         intensities: Vector | None = None,
         kept: Mask | None = None,
     ) -> None:
-        """`points`: array-like with at least 3 columns; the first 3 are used."""
+        """`points`: array-like with at least 3 columns; the first 3 are used.
+
+        Raises SegslamError for another shape, for a stamp that is no integer, and for labels or times that are not one
+        for each point.
+        """
         xyz = as_points(points)
+        if not isinstance(stamp_ns, int | np.integer):
+            raise SegslamError(f"stamp_ns {stamp_ns!r}: give integer nanoseconds")
+        if labels is not None and not callable(labels):
+            check_labels(labels, xyz)
+        if times is not None and len(times) not in (0, len(xyz)):
+            raise SegslamError(f"times: {len(times)} times for {len(xyz)} points; give one for each, or none")
         labels = np.zeros(len(xyz), np.uint8) if labels is None else labels
         times = np.empty(0) if times is None else times
         values = (xyz, stamp_ns, index, labels, times, intensities, kept)

@@ -35,16 +35,19 @@ Rows = list[list[float]]
 """Longitude and latitude (degrees), height above the ellipsoid (m), of each scan."""
 
 
-def export(run: str | Path, files: Sequence[str | Path], *, settings: Sequence[str] = ()) -> dict[str, Any]:
+def export(
+    run: str | Path, files: str | Path | Sequence[str | Path], *, settings: Sequence[str] = ()
+) -> dict[str, Any]:
     """Write the map of a finished run, like `segslam export`; existing files are replaced. Returns figures of the map.
 
-    `files`: .ply .pcd .las .laz (cloud), .png (top view), .yaml (grid) or before_after.png, and of a georeferenced run
-    .tif, .geojson, .kml, .gpx and map_projector_info.yaml; all are written, or none.
+    `files`, one or several: .ply .pcd .las .laz (cloud), .png (top view), .yaml (grid) or before_after.png, and of a
+    georeferenced run .tif, .geojson, .kml, .gpx and map_projector_info.yaml; all are written, or none.
     `settings`: changes such as `"map.color=height"`. Raises SegslamError, naming the file and the remedy.
     """
     log = read_log(Path(run))
     config = load_config(None, settings, base=log.config).map
-    return write_maps(log, [Path(file) for file in files], config=config)
+    several = [files] if isinstance(files, str | Path) else files
+    return write_maps(log, [Path(file) for file in several], config=config)
 
 
 def write_maps(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from segslam.core.config import Config, OdometryConfig
+from segslam.core.config import Config, OdometryConfig, check_config
 from segslam.core.trajectory import read_poses
 from segslam.core.types import BadScan, SegslamError, Step, Trajectory
 from segslam.labels.encodings import Encoding
@@ -51,6 +51,7 @@ def map_folder(
     georeferences the folder of the run. Scans that cannot be used are skipped with a warning. Raises SegslamError,
     naming the file and the remedy, also if no scan remains.
     """
+    check_config(config)
     source = DataSource(Path(data), sequence, dataset, labels, encoding, frames, topic)
     scans = open_scans(source, config or Config())
     config = in_effect(config or preset(preset_for(extent_m(scans))), scans.vertical_angle_deg)

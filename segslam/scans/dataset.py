@@ -205,6 +205,8 @@ def selected_rows(scan_index: Indices, frames: str | None, source: Path) -> Indi
     """
     if frames is None:
         return np.arange(len(scan_index))
+    if not isinstance(frames, str):
+        raise SegslamError(f"frames {frames!r}: give a text, 'A:B' for scans A to B - 1, for example '0:100'")
     first, last, step = (*frames.split(":"), "", "")[:3]
     if frames.count(":") not in (1, 2) or not all(text.strip().isdecimal() for text in (first, last, step) if text):
         raise SegslamError(f"--frames {frames}: write A:B, scans A to B - 1, or A:B:STEP, for example 0:100 or ::2")

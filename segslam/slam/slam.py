@@ -10,7 +10,7 @@ from time import monotonic
 
 import numpy as np
 
-from segslam.core.config import Config
+from segslam.core.config import Config, check_config
 from segslam.core.memory import give_back
 from segslam.core.threads import Stopwatch
 from segslam.core.trajectory import corrected_poses
@@ -63,6 +63,7 @@ class Slam:
         `edits` forbids loops between keyframes, or has them tried. `known`: results of the drives' own adjustments, if
         several are repeated as one.
         """
+        check_config(config)
         self.config = config or Config()
         self.known = known
         self._tracker = Tracker(self.config, odometry=odometry)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from numpy.typing import ArrayLike
 
 from segslam.core import geometry
-from segslam.core.config import Config
+from segslam.core.config import Config, check_config
 from segslam.core.threads import Stopwatch, at_once
 from segslam.core.types import (
     Alignment,
@@ -44,6 +44,7 @@ def register(
     point; for a scan without labels, geometric labels are computed. The pose is `fine.T_target_source` of the result,
     or the result is `Rejected`. Raises SegslamError for arrays of another shape.
     """
+    check_config(config)
     config = config or Config()
 
     def prepared(given: ArrayLike, labels: Labels | None) -> PreparedScan:

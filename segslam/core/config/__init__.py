@@ -133,6 +133,12 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = (), *
     return validated(Config, _without_removed(overridden, source), source)
 
 
+def check_config(config: Config | None) -> None:
+    """Raises SegslamError for settings that are neither a Config nor None."""
+    if not isinstance(config, Config | None):
+        raise SegslamError(f"config: {brief(str(config))} is not a Config; give one, for example load_config(FILE)")
+
+
 def with_overrides(values: dict[str, Any], overrides: Sequence[str], *, source: str, example: str) -> dict[str, Any]:
     """The values of sections, changed by `section.key=value` texts; `source` and `example` are for messages."""
     changed = dict(values)

@@ -61,6 +61,8 @@ def fleet(
     all drives are in one frame. `settings`: `section.key=value` texts for all drives. Raises SegslamError if no drive
     could be mapped, or if a worker cannot take part; a drive that fails is in the result, with the reason.
     """
+    if num_workers is not None and num_workers < 1:
+        raise SegslamError(f"fleet: num_workers={num_workers}; give 1 or more")
     listed = read_drives(Path(drives)) if isinstance(drives, str | Path) else drives_of(drives)
     if not listed:
         raise SegslamError("fleet: no drive; give recordings, or a list of them")

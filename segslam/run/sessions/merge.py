@@ -11,7 +11,7 @@ import numpy as np
 
 from segslam.candidates.proximity import BREAK_STEP_M
 from segslam.core import geometry
-from segslam.core.config import Config
+from segslam.core.config import Config, check_config
 from segslam.core.types import LoopAttempt, SegslamError, Step, Trajectory
 from segslam.gnss import Use
 from segslam.gnss.fixes import Row
@@ -178,7 +178,8 @@ def merge(
     the true poses of all runs are in one frame. `on_step` is called with each Step. Raises SegslamError, naming the
     run, if one did not finish, is damaged, is given twice or was not found in any other.
     """
-    sessions = read_sessions([Path(run) for run in runs])
+    check_config(config)
+    sessions = read_sessions([Path(run) for run in ([runs] if isinstance(runs, str | Path) else runs)])
     config = config or sessions[0].run.config
     merged = plan(sessions, config=config, same_reference=same_reference)
     return write_merged(merged, new_folder(Path(out)), config, on_step=on_step)

@@ -135,6 +135,8 @@ def test_a_run_is_evaluated_exported_and_reported_by_public_names(made: MadeRun,
         assert segslam.evaluate(estimate, reference)["ate_m"] == pytest.approx(figures["ate_m"], rel=1e-4)
     with pytest.raises(segslam.SegslamError, match="one for each"):
         segslam.evaluate(run.result.trajectory.T_world_lidar[:-1], made.truth.T_world_lidar)
+    with pytest.raises(segslam.SegslamError, match="rpe_distance_m=0; give a distance above 0"):
+        segslam.evaluate(run, rpe_distance_m=0)
     with pytest.raises(segslam.SegslamError, match="no ground truth"):
         segslam.evaluate(run.result.trajectory)
     with pytest.raises(segslam.SegslamError, match=r"give finite matrices, \(n, 4, 4\)"):
@@ -142,6 +144,8 @@ def test_a_run_is_evaluated_exported_and_reported_by_public_names(made: MadeRun,
     assert segslam.report(str(made.folder)) == made.folder / "report.html"
     assert segslam.export(made.folder, tmp_path / "map.ply")["num_map_points"] > 0
     assert (tmp_path / "map.ply").is_file()
+    with pytest.raises(segslam.SegslamError, match="given twice"):
+        segslam.export(made.folder, [tmp_path / "a.kml", tmp_path / "a.kml"])
 
 
 def test_odd_arguments_are_refused_in_one_line(tmp_path: Path) -> None:
@@ -161,6 +165,8 @@ WRONG_KINDS = {
     "segslam.Scan(np.ones((5, 3)), 0.5)": "stamp_ns 0.5: give integer nanoseconds",
     "segslam.Scan(np.ones((5, 3)), 0, times=np.ones(3))": "3 times for 5 points",
     "segslam.Scan(np.ones((5, 3)), 0, labels=np.ones(2, np.uint8))": "2 labels for 5 points",
+    "segslam.evaluate(np.eye(4)[None], np.eye(4)[None], align='Sim3')": "align='Sim3': unknown; known: se3",
+    "segslam.fleet('~unknown-user/drives.yaml', 'fleet')": "there is no user with this name",
     "segslam.read_run('scan.bin')": "not a run",
 }
 

@@ -1,7 +1,7 @@
 """Paths as users give them, their texts, and atomic writing: a file appears when it is complete, or not at all."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from segslam.core.errors import SegslamError, WorkFailed, brief, reason, unreadable
@@ -52,7 +52,8 @@ def whole_file(file: Path) -> Iterator[Path]:
     except OSError as error:
         raise cannot_write(file, error) from error
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def write_whole(file: Path, content: bytes | str) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 from segslam.core.errors import brief
 from segslam.core.types import SegslamError
+from segslam.core.whole_files import expanded
 from segslam.gnss.csv_fixes import read_csv
 from segslam.gnss.fixes import Fixes, Row, bad_line, check_degrees, make_fixes, number_in, stamp_of, text_lines
 from segslam.gnss.nmea import is_nmea, read_nmea
@@ -20,7 +21,7 @@ def read_fixes(source: str | Path, *, recording: Path | None = None) -> Fixes:
 
     Raises SegslamError, naming file and line, if they cannot be read.
     """
-    path = Path(source).expanduser()
+    path = expanded(source)
     if not path.exists():
         if str(source).startswith("/") and recording is not None and _is_recording(recording):
             return make_fixes(str(source), _read_messages(recording, str(source)))

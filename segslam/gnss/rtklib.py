@@ -79,8 +79,9 @@ def _stamp(file: Path, number: int, first: str, second: str, *, clock: str) -> i
             week, seconds = int(first), float(second)
             moment = GPS_EPOCH + timedelta(weeks=week, seconds=int(seconds))
             return stamp_of(_utc(moment, clock)) + round((seconds - int(seconds)) * 1e9)
-        form = "%Y/%m/%d %H:%M:%S.%f" if "." in second else "%Y/%m/%d %H:%M:%S"
-        return stamp_of(_utc(datetime.strptime(f"{first} {second}", form).replace(tzinfo=UTC), clock))
+        whole, _, fraction = second.partition(".")
+        moment = datetime.strptime(f"{first} {whole}", "%Y/%m/%d %H:%M:%S").replace(tzinfo=UTC)
+        return stamp_of(_utc(moment, clock)) + int(fraction.ljust(9, "0")[:9])
     except (ValueError, OverflowError) as error:
         what = f"time {first[:20]} {second[:20]} is neither week and seconds nor a date"
         raise bad_line(file, number, what) from error

@@ -169,7 +169,7 @@ class OriginCheck(Thread):
         try:
             await self._pass_on(reader, writer)
         except (OSError, EOFError, TimeoutError, asyncio.LimitOverrunError, asyncio.CancelledError):
-            pass  # the viewer has gone, or never was one
+            writer.transport.abort()  # the viewer has gone, or never was one, or reads no more: nothing is sent to it
         finally:
             self._connections.discard(task)
             writer.close()

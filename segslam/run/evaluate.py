@@ -1,6 +1,7 @@
 """Errors of runs, trajectories and pose files against ground truth."""
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
@@ -28,6 +29,10 @@ def evaluate(
     row by row. `reference` may be omitted for a run with ground truth. `align`, `rpe_distance_m` as for `--align` and
     `--rpe-distance`; `up`: upward axis of the reference. Raises SegslamError if fewer than three poses match.
     """
+    if align not in get_args(Align):
+        raise SegslamError(f"evaluate: align={align!r}: unknown; known: {', '.join(get_args(Align))}")
+    if rpe_distance_m is not None and not rpe_distance_m > 0.0:
+        raise SegslamError(f"evaluate: rpe_distance_m={rpe_distance_m}; give a distance above 0")
     if reference is None:
         reference = estimate.reference if isinstance(estimate, FinishedRun) else None
         if reference is None:

@@ -92,7 +92,6 @@ class Run:
         self._stage_ms: dict[str, list[float]] = defaultdict(list)
         try:
             self._sessions = parts_in(options.get("sessions", ""))
-            write_whole(folder / "config.yaml", config_to_yaml(slam.config))
             self._log = LogWriter(
                 folder / (LOG + UNFINISHED if resumes else LOG),
                 config=slam.config,
@@ -101,7 +100,11 @@ class Run:
                 reference=reference,
                 options=options,
                 mirror=mirror,
+                replaces=resumes,
             )
+            write_whole(folder / "config.yaml", config_to_yaml(slam.config))
+        except FileExistsError as error:
+            raise SegslamError(f"{folder}: another run has begun there; give another folder") from error
         except BaseException:
             self._remove_unbegun()
             raise

@@ -4,6 +4,7 @@ The number of a scan is that of its file. It is also its row in times.txt and in
 files hold poses of the left camera in the frame of the first; this module returns LiDAR poses.
 """
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -161,5 +162,8 @@ def _numbered_scans(velodyne: Path) -> tuple[list[Path], Indices]:
     misnamed = [file for file in files if not file.stem.isdecimal() or int(file.stem) >= 2**63]
     if misnamed:
         raise SegslamError(f"{misnamed[0]}: the name is not a scan number; rename the file, for example 000000.bin")
-    files.sort(key=lambda file: int(file.stem))
+    files.sort(key=lambda file: (int(file.stem), file.stem))
+    for file, following in pairwise(files):
+        if int(file.stem) == int(following.stem):
+            raise SegslamError(f"{file}: has the same number as {following.name}; leave one of the two out")
     return files, np.array([int(file.stem) for file in files])

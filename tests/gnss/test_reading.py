@@ -303,6 +303,8 @@ def test_a_real_receiver_in_a_city_is_as_wrong_as_known(data_dir: Path) -> None:
         ("GPST", "2024/05/01 00:00:18.000"),
         ("UTC", "2024/05/01 00:00:00.000"),
         ("JST", "2024/05/01 09:00:00.000"),
+        ("UTC", "2024/05/01 00:00:00.000000000"),
+        ("UTC", "2024/05/01 00:00:00"),
         ("GPST", "2312 259218.000"),
         ("UTC", "2312 259200.000"),
     ],
@@ -335,3 +337,8 @@ def test_midnight_is_passed_without_a_fix(tmp_path: Path) -> None:
 def test_blanks_before_a_sentence_are_ignored(tmp_path: Path) -> None:
     (tmp_path / "a.log").write_text(" " + sentence("GPGGA,235958.00,4800.0,N,00800.0,E,1,8,1,100,M,48,M,,") + "\n")
     assert read_fixes(tmp_path / "a.log").places.tolist() == [[48.0, 8.0, 148.0]]
+
+
+def test_the_home_of_an_unknown_user_is_refused() -> None:
+    with pytest.raises(SegslamError, match="there is no user with this name"):
+        read_fixes("~unknown-user/fixes.csv")

@@ -44,6 +44,7 @@ def test_a_list_has_paths_relative_to_it_and_the_options_of_map(tmp_path: Path) 
         ("- {name: b, data: }", "drive 1: expected a path or options with data"),
         ("- a\n- ''", "drive 2: expected a path or options with data"),
         ("- {data: a, frame: '0:3'}", "drive 1: unknown option 'frame'; known: name, data"),
+        ("- ~unknown-user/a", "there is no user with this name"),
         ("- {data: a, set: 3}", "drive 1: set: expected texts"),
         ("- {data: a, name: ../b}", "drive 1: name '../b': use letters"),
         ("- {data: a, topic: [1]}", "drive 1: topic: expected a text"),

@@ -279,3 +279,42 @@ def test_what_an_interrupted_step_left_is_removed(tmp_path: Path) -> None:
     assert len(list((tmp_path / "index").iterdir())) == 1
     steps.remove_unfinished(tmp_path)
     assert list((tmp_path / "index").iterdir()) == []
+
+
+def test_a_run_that_is_not_of_the_fleet_is_not_replaced(recordings: list[Path], tmp_path: Path) -> None:
+    own = tmp_path / "runs" / "monday"
+    own.mkdir(parents=True)
+    (own / "log.mcap").write_text("made by segslam map")
+    with pytest.raises(SegslamError, match=r"runs/monday: not made by segslam fleet"):
+        map_drive(tmp_path, Drive("monday", str(recordings[0])))
+    assert [file.name for file in tmp_path.rglob("*") if file.is_file()] == ["log.mcap"]
+
+
+def test_a_second_call_leaves_the_work_of_the_first_alone(recordings: list[Path], tmp_path: Path) -> None:
+    with segslam.run.fleets.orchestrate._alone_in(tmp_path):
+        part = steps._beside(tmp_path / "runs" / "monday")
+        part.mkdir(parents=True)
+        with pytest.raises(SegslamError, match="another call of segslam fleet works there"):
+            fleet([str(recordings[0])], tmp_path)
+        assert part.is_dir()
+    foreign = tmp_path / ".drive.bag.partial"
+    foreign.write_text("of another program")
+    with segslam.run.fleets.orchestrate._alone_in(tmp_path):
+        assert not part.exists()
+    assert foreign.exists()
+
+
+def test_what_is_kept_of_drives_is_not_that_of_drives_with_other_names(tmp_path: Path) -> None:
+    """Names become others when a drive of the same name is added."""
+
+    def key_of(name: str) -> str:
+        return steps._component_key([steps.Mapped(name, "key")], [None], same_reference=False)
+
+    assert key_of("scans") != key_of("scans-1")
+    (tmp_path / "index").mkdir()
+    spectra = np.random.default_rng(0).integers(0, 255, (3, 24, 60), dtype=np.uint8)
+    for name in ("scans", "scans-1", "other"):
+        np.save(tmp_path / "index" / f"{name}-key.npy", spectra)
+    for name in ("scans", "scans-1"):
+        found = steps.propose(tmp_path, steps.Mapped("other", "key"), [steps.Mapped(name, "key")])
+        assert set(found) == {name}

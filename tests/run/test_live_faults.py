@@ -25,7 +25,7 @@ from segslam.odometry.tracker import Tracked, Tracker
 from segslam.output.log import read_log
 from segslam.run.live.folder import FolderSource
 from segslam.run.live.front import Front
-from segslam.run.live.serve import OdometryEnded, Past, Placed, _place_all
+from segslam.run.live.serve import Ended, OdometryEnded, Past, Placed, _place_all
 from segslam.run.live.waiting import Arrival, Waiting
 from segslam.scans.presets import SETTINGS as PRESETS
 
@@ -248,6 +248,24 @@ def test_a_signal_that_does_not_end_a_wait_for_scans_is_heard(tmp_path: Path) ->
         giving_up.cancel()
     assert late == []
     assert front.is_stopping
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("fails", ["start", "tell"])
+def test_a_front_process_that_cannot_be_started_again_ends_the_run(fails: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_memory(*_: object) -> None:
+        raise OSError(12, "Cannot allocate memory")
+
+    with Front(HangingSource(), dict.fromkeys(PRESETS, Config()), tell=lambda _: None) as front:
+        front.wait_until_ready()
+        monkeypatch.setattr(front, f"_{fails}", no_memory)
+        giving_up = threading.Timer(30, lambda: front._received.put(Ended("waits forever")))
+        giving_up.start()
+        front._process.kill()
+        assert list(front) == []
+        giving_up.cancel()
+    assert front.ended.failed
+    assert "Cannot allocate memory" in front.ended.why
 
 
 @pytest.mark.long

@@ -8,9 +8,10 @@ import pytest
 from helpers.drives import round_drive, write_kitti_sequence
 
 from segslam import open_dataset
-from segslam.core.config import Config
-from segslam.core.types import BadScan, Scan
+from segslam.core.config import Config, ProximityConfig
+from segslam.core.types import BadScan, Scan, SegslamError
 from segslam.odometry.sweep import GivenOdometry
+from segslam.output.log import LogWriter
 from segslam.run.run import Run
 from segslam.scans import Dataset
 from segslam.slam.slam import Slam
@@ -66,3 +67,27 @@ def test_a_stamp_that_is_too_late_or_too_early_loses_its_own_scan_only(
         steps = list(run.map(_Shifted(shifts)))
     assert [row for row, step in enumerate(steps) if isinstance(step, BadScan)] == skipped
     assert len(steps) == 6
+
+
+@pytest.mark.parametrize("is_finished", [False, True])
+def test_a_run_never_touches_one_that_began_in_its_folder(tmp_path: Path, is_finished: bool) -> None:
+    """Two commands may find the folder empty; the second makes its log later."""
+    with Run(tmp_path, Slam(), dataset="first") as first:
+        next(first.map(_Shifted({})))
+        if is_finished:
+            first.__exit__()
+        before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+        with pytest.raises(SegslamError, match="another run has begun there"):
+            Run(tmp_path, Slam(Config(proximity=ProximityConfig(base_radius_m=9.0))), dataset="second")
+        assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+def test_a_log_that_is_being_written_is_not_replaced(tmp_path: Path) -> None:
+    with (
+        LogWriter(tmp_path / "log.mcap", config=Config(), dataset="first"),
+        LogWriter(tmp_path / "log.mcap.part", config=Config(), dataset="second") as log,
+    ):
+        before = (tmp_path / "log.mcap").read_bytes()
+        with pytest.raises(SegslamError, match="another process writes it"):
+            log.move(tmp_path / "log.mcap")
+        assert (tmp_path / "log.mcap").read_bytes() == before

@@ -264,6 +264,13 @@ def test_broken_time_is_named_with_its_line(tmp_path: Path) -> None:
         _open(tmp_path)
 
 
+def test_two_scans_of_one_number_are_refused(tmp_path: Path) -> None:
+    folder = _write_sequence(tmp_path, [0, 1])
+    (folder / "velodyne" / "1.bin").write_bytes((folder / "velodyne" / "000001.bin").read_bytes())
+    with pytest.raises(SegslamError, match=r"000001\.bin: has the same number as 1\.bin"):
+        _open(tmp_path)
+
+
 def test_misnamed_scan_is_refused_but_hidden_files_are_not_scans(tmp_path: Path) -> None:
     folder = _write_sequence(tmp_path, [0])
     (folder / "velodyne" / "._000000.bin").write_bytes(b"")

@@ -50,9 +50,9 @@ Mirror = Callable[[str, bytes, int], None]
 class Output:
     """The stream of MCAP's writer: nothing is pending after a failure, and no other process can write the file."""
 
-    def __init__(self, path: Path) -> None:
-        """Raises OSError if the file cannot be written, or another process writes it."""
-        self.raw = path.open("a+b", buffering=0)
+    def __init__(self, path: Path, *, replaces: bool = False) -> None:
+        """Raises OSError if it cannot be written, another process writes it, or, without `replaces`, it exists."""
+        self.raw = path.open("a+b" if replaces else "x+b", buffering=0)
         fcntl.flock(self.raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self.raw.truncate(0)
         self.raw.seek(0)
@@ -98,8 +98,11 @@ class LogWriter:
         reference: Trajectory | None = None,
         options: Mapping[str, str] = MappingProxyType({}),
         mirror: Mirror | None = None,
+        replaces: bool = False,
     ) -> None:
-        """`reference`: true poses; `T_camera_lidar`: calibration of KITTI data. A replay has no other source for both.
+        """Raises FileExistsError if there is a file, unless `replaces` is set; SegslamError if it cannot be written.
+
+        `reference`: true poses; `T_camera_lidar`: calibration of KITTI data. A replay has no other source for both.
 
         `options` are options beside the settings, which must be the same when the run is resumed.
         `mirror` is called with each message that is written.
@@ -115,7 +118,9 @@ class LogWriter:
         self._steps_of_keyframes: dict[int, tuple[int, int]] = {}
         """Position in the file, and size, of the step of each keyframe."""
         try:
-            self._output = Output(path)
+            self._output = Output(path, replaces=replaces)
+        except FileExistsError:
+            raise
         except OSError as error:
             raise SegslamError(f"{path}: cannot write the log ({error.strerror}); give another folder") from error
         self._mcap = Writer(cast(IO[bytes], self._output), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
@@ -179,9 +184,14 @@ class LogWriter:
         self._write([*messages, (schema.RESULT, _json(trajectory))], stamp_ns=stamp_ns)
 
     def move(self, path: Path) -> None:
-        """Replace the file `path`, after all data written here is safely on the disk."""
+        """Replace the file `path`, after all data written here is safely on the disk.
+
+        Raises SegslamError if another process writes the file, WorkFailed if it cannot be replaced.
+        """
         try:
             os.fsync(self._output.raw.fileno())
+            if is_being_written(path):
+                raise SegslamError(f"{path}: another process writes it; wait for its end")
             self._path.replace(path)
         except OSError as error:
             raise WorkFailed(f"{path}: cannot be replaced by {self._path} ({error.strerror})") from error

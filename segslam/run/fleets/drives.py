@@ -13,7 +13,7 @@ from typing import Any
 from segslam.core.config import parse_yaml, short
 from segslam.core.errors import unreadable
 from segslam.core.types import SegslamError
-from segslam.core.whole_files import read_text
+from segslam.core.whole_files import expanded, read_text
 from segslam.labels.label_files import NETWORK, whole_source
 
 
@@ -115,7 +115,7 @@ def _drive(value: Any, where: str, folder: Path) -> Drive:
         texts["labels"] = whole_source(texts["labels"], folder)
     for name in PATHS:
         if texts.get(name):
-            texts[name] = str((folder / Path(texts[name]).expanduser()).resolve())
+            texts[name] = str((folder / expanded(texts[name])).resolve())
     if not re.fullmatch(r"[\w. +=@-]*", texts["name"]) or texts["name"].startswith("."):
         raise SegslamError(f"{where}: name {short(texts['name'])}: use letters, digits, spaces and _ . + = @ -")
     return Drive(**texts, set=tuple(settings))

@@ -1,15 +1,18 @@
 """A fleet: drives are mapped, related to each other, and joined to components, each in one frame."""
 
+import fcntl
 import json
+import logging
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 from segslam.core.types import SegslamError, WorkFailed
-from segslam.core.whole_files import write_whole
+from segslam.core.whole_files import expanded, write_whole
 from segslam.run.fleets import steps
 from segslam.run.fleets.drives import Drive, drives_of, read_drives
 from segslam.run.fleets.relations import Components
@@ -17,6 +20,8 @@ from segslam.run.fleets.steps import Mapped
 from segslam.run.fleets.workers import Outcome, Workers, workers
 from segslam.run.sessions.session_pose import MIN_FOUND, Relation
 from segslam.slam.adjustment import Progress, no_progress
+
+logger = logging.getLogger(__name__)
 
 FILE = "fleet.json"
 CORES_OF_WORKER = 2
@@ -63,21 +68,47 @@ def fleet(
     """
     if num_workers is not None and num_workers < 1:
         raise SegslamError(f"fleet: num_workers={num_workers}; give 1 or more")
-    listed = read_drives(Path(drives)) if isinstance(drives, str | Path) else drives_of(drives)
+    listed = read_drives(expanded(drives)) if isinstance(drives, str | Path) else drives_of(drives)
     if not listed:
         raise SegslamError("fleet: no drive; give recordings, or a list of them")
-    folder = Path(out).expanduser().resolve()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        steps.remove_unfinished(folder)
-    except OSError as error:
-        raise SegslamError(f"{folder}: cannot be written ({error.strerror}); give another with --out") from error
+    folder = expanded(out).resolve()
     number = num_workers or max((os.cpu_count() or 1) // CORES_OF_WORKER, 1)
-    with workers(folder, number=number, scheduler=scheduler) as (run, dashboard):
+    with _alone_in(folder), workers(folder, number=number, scheduler=scheduler) as (run, dashboard):
         if dashboard:
             say(f"dashboard: {dashboard}")
         listed = [replace(drive, set=(*settings, *drive.set)) for drive in listed]
         return _Fleet(folder, run, shown, say).run(listed, same_reference)
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Context manager that locks a fleet's folder, where the file system can, and removes what interrupted steps left.
+
+    Raises SegslamError if another call works there, whose unfinished steps would be removed, or it cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise _cannot_write(folder, error) from error
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise SegslamError(f"{folder}: another call of segslam fleet works there; wait for its end") from error
+        except OSError as error:  # such as NFS, which does not lock folders
+            logger.info("%s: not locked (%s)", folder, error.strerror)
+        try:
+            steps.remove_unfinished(folder)
+        except OSError as error:
+            raise _cannot_write(folder, error) from error
+        yield
+    finally:
+        os.close(lock)
+
+
+def _cannot_write(folder: Path, error: OSError) -> SegslamError:
+    return SegslamError(f"{folder}: cannot be written ({error.strerror}); give another with --out")
 
 
 class _Fleet:

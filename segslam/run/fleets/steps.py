@@ -64,11 +64,16 @@ class Mapped:
 
 
 def _made_with(folder: Path) -> str:
-    """The key that a whole folder was made with; empty if there is none."""
+    """The key that a whole folder was made with; empty if there is no folder.
+
+    Raises SegslamError for a folder without a key: it is not of a fleet, and must not be replaced.
+    """
+    if not folder.exists():
+        return ""
     try:
         return (folder / KEY).read_text(encoding="utf-8")
-    except OSError:
-        return ""
+    except OSError as error:
+        raise SegslamError(f"{folder}: not made by segslam fleet; give another folder with --out") from error
 
 
 def map_drive(fleet: Path, drive: Drive) -> Mapped:
@@ -125,7 +130,7 @@ def index_drive(fleet: Path, drive: Mapped) -> Mapped:
 
 def propose(fleet: Path, drive: Mapped, earlier: Sequence[Mapped]) -> Likely:
     """For each earlier drive, the keyframes of this one that look most like one of its places, by its name."""
-    key = key_of([one.key for one in (*earlier, drive)])
+    key = key_of([(one.name, one.key) for one in (*earlier, drive)])
     file = fleet / PROPOSALS / f"{drive.name}-{key}.json"
     if not file.exists():
         proposed = _proposed(fleet, drive, earlier)
@@ -196,7 +201,7 @@ def _component_key(drives: Sequence[Mapped], poses: Sequence[SessionPose | None]
     lines = [""]
     for drive, pose in zip(drives, poses, strict=True):
         related = pose and [pose.earlier, pose.T_earlier_world.tolist()]
-        lines.append(key_of(lines[-1], drive.key, related, same_reference))
+        lines.append(key_of(lines[-1], drive.name, drive.key, related, same_reference))
     return "\n".join(lines[1:])
 
 
@@ -251,7 +256,7 @@ def remove_components(fleet: Path, *, keep: int) -> None:
 
 
 def remove_unfinished(fleet: Path) -> None:
-    """Remove what interrupted steps left."""
+    """Remove what interrupted steps left (`_beside`)."""
     for folder in (fleet, *(fleet / name for name in (RUNS, INDEX, PROPOSALS, PAIRS, ALIGNMENTS))):
-        for part in folder.glob(f".*{UNFINISHED}*") if folder.is_dir() else ():
+        for part in folder.glob(f".*.{'?' * 32}{UNFINISHED}*") if folder.is_dir() else ():
             shutil.rmtree(part) if part.is_dir() else part.unlink()

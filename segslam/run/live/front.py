@@ -60,7 +60,7 @@ class Front:
         self.num_restarts = 0
         self.ended = Ended()
         self._start()
-        self._receiver = Thread(target=self._receive, name="receive", daemon=True)
+        self._receiver = Thread(target=self._receive_all, name="receive", daemon=True)
         self._receiver.start()
 
     def wait_until_ready(self) -> None:
@@ -118,6 +118,13 @@ class Front:
         if self.is_stopping:
             self.stop()
 
+    def _receive_all(self) -> None:
+        """As `_receive`; a failure ends the stream, for example if there is no memory for another front process."""
+        try:
+            self._receive()
+        except Exception as error:
+            self._received.put(Ended(f"the odometry process cannot be followed ({error!r})", failed=True))
+
     def _receive(self) -> None:
         """Pass on what the front process sends, and start another one if it dies."""
         while (died := self._receive_until_dead()) is not None:
@@ -136,19 +143,20 @@ class Front:
 
     def _receive_until_dead(self) -> Ended | None:
         """None after the regular end of the stream, otherwise what the process died of."""
-        try:
-            while True:
+        while True:
+            try:
                 item = self._pipe.recv()
-                if isinstance(item, Ended):
-                    if item.died:
-                        return item
-                    note_peak_of(self._process.pid)
-                    self._received.put(item)
-                    return None
-                self._take(item)
-        except (EOFError, OSError):
-            self._process.join(timeout=1.0)
-            return Ended(f"the odometry process has ended ({_cause(self._process.exitcode)})", failed=True, died=True)
+            except (EOFError, OSError):
+                self._process.join(timeout=1.0)
+                why = f"the odometry process has ended ({_cause(self._process.exitcode)})"
+                return Ended(why, failed=True, died=True)
+            if isinstance(item, Ended):
+                if item.died:
+                    return item
+                note_peak_of(self._process.pid)
+                self._received.put(item)
+                return None
+            self._take(item)
 
     def _take(self, item: object) -> None:
         if isinstance(item, str):

@@ -31,7 +31,7 @@ from segslam.core.types import (
 from segslam.graph import noise
 from segslam.graph.adjusted import solve_adjusted, weighted_edges, without_shared_rotation
 from segslam.graph.chains import Chains
-from segslam.graph.closure_pairs import Matrices, Pairs, consistent_pairs, largest_consistent
+from segslam.graph.closure_pairs import MAX_PAIRED, Matrices, Pairs, consistent_pairs, largest_consistent
 from segslam.graph.edges import (
     Edge,
     Transforms,
@@ -249,6 +249,7 @@ class PoseGraph:
 
         `consistent` also rejects motions of the odometry that closures of more than one place contradict.
         """
+        self._adjustment = None
         robust = self.optimize(tolerance=1e-5)
         if self._config.final == "none":
             return robust
@@ -345,8 +346,8 @@ class PoseGraph:
         self._chains = None
 
     def _linked(self) -> gtsam.Values:
-        """The last estimate, with segments between breaks moved to satisfy consistent closures."""
-        if not self._has_breaks or not self._closures:
+        """The last estimate, with segments between breaks moved to satisfy consistent closures, up to `MAX_PAIRED`."""
+        if not self._has_breaks or not 0 < len(self._closures) <= MAX_PAIRED:
             return self._values
         odometry = self._kept_odometry()
         likely = largest_consistent(consistent_pairs(odometry, self._closures, self._inlier_bound))

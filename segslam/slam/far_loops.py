@@ -4,7 +4,7 @@ A loop is closed only if several keyframes confirm it (`Confirmation`).
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -55,11 +55,16 @@ class FarLoops:
         self._places.add(keyframe_id, signature)
         self._signatures[keyframe_id] = signature
 
-    def attempt(self, keyframe_id: int, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
-        """Try the place most similar to that of a keyframe, once; closures follow once enough others confirm it."""
+    def attempt(
+        self, keyframe_id: int, watch: Stopwatch, waiting: Collection[tuple[int, int]]
+    ) -> tuple[LoopAttempt, ...]:
+        """Try the place most similar to that of a keyframe, once; closures follow once enough others confirm it.
+
+        `waiting`: pairs that the search by distance has registered, and which wait for confirmation already.
+        """
         with watch("propose"):
             loop = self._loop(keyframe_id, self._signatures[keyframe_id])
-        if loop is None:
+        if loop is None or loop.candidate.pair in waiting:
             return ()
         candidate = loop.candidate
         own = Stopwatch()

@@ -18,12 +18,12 @@ class LoopEdits:
     added: frozenset[Pair] = frozenset()
 
     def __post_init__(self) -> None:
-        """Raises SegslamError for a pair that is both, and for a keyframe with itself."""
+        """Raises SegslamError for a pair that is both, or not a newer and an older keyframe."""
         for newer, older in sorted(self.forbidden & self.added):
             raise SegslamError(f"{newer}:{older}: both forbidden and added; give one of the two")
         for newer, older in sorted(self.forbidden | self.added):
-            if older < 0 or newer == older:
-                raise SegslamError(f"{newer}:{older}: give the ids of two keyframes, as in loops.csv: 120:15")
+            if not 0 <= older < newer:
+                raise SegslamError(f"{newer}:{older}: give two keyframes of loops.csv, the newer first: 120:15")
 
     def and_then(self, later: "LoopEdits") -> "LoopEdits":
         """These edits followed by others, which win where the two contradict."""

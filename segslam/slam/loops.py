@@ -9,7 +9,16 @@ from segslam.candidates import PlaceSignature
 from segslam.candidates.proximity import LEAST_PROBABILITY, ProximityDetector
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch, at_once
-from segslam.core.types import Alignment, CloudOf, LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
+from segslam.core.types import (
+    Alignment,
+    CloudOf,
+    LoopAttempt,
+    LoopCandidate,
+    LoopClosure,
+    Rejected,
+    RejectReason,
+    Transform,
+)
 from segslam.graph import Graph
 from segslam.graph.chains import far_from_prior, prior_gate
 from segslam.graph.confirmation import Confirmation
@@ -102,7 +111,8 @@ class LoopCloser:
         has_closure = any(isinstance(attempt.outcome, LoopClosure) for attempt in near)
         if has_closure or not is_first_time or not self._config.retrieval.enabled:
             return near
-        far = self._far.attempt(keyframe_id, watch)
+        waiting = {attempt.candidate.pair for attempt in near if _is_unconfirmed(attempt)}
+        far = self._far.attempt(keyframe_id, watch, waiting)
         self._take(far)
         return (*near, *far)
 
@@ -171,3 +181,7 @@ class LoopCloser:
             return False
         near = candidate.near_probability
         return MISLED * (1.0 - near) <= LEAST_PROBABILITY * near
+
+
+def _is_unconfirmed(attempt: LoopAttempt) -> bool:
+    return isinstance(attempt.outcome, Rejected) and attempt.outcome.reason is RejectReason.UNCONFIRMED

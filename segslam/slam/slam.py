@@ -3,6 +3,7 @@
 It uses no files and no viewers; these consume the Steps that it returns.
 """
 
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,6 +16,7 @@ from segslam.core.memory import give_back
 from segslam.core.threads import Stopwatch
 from segslam.core.trajectory import corrected_poses
 from segslam.core.types import (
+    BadScan,
     GraphEstimate,
     Keyframe,
     LoopAttempt,
@@ -40,6 +42,8 @@ from segslam.slam.adjustment import Known, Progress, adjust, no_progress, veloci
 from segslam.slam.loop_edits import NO_EDITS, LoopEdits
 from segslam.slam.loops import ROUNDS, LoopCloser
 from segslam.slam.slam_result import SlamResult as SlamResult
+
+logger = logging.getLogger(__name__)
 
 
 class Slam:
@@ -83,6 +87,7 @@ class Slam:
         self._keyframe_rows: list[int] = []
         self._attempts: list[LoopAttempt] = []
         self._is_finished = False
+        self._result: SlamResult | None = None
 
     def __repr__(self) -> str:
         loops = sum(isinstance(attempt.outcome, LoopClosure) for attempt in self._attempts)
@@ -150,8 +155,10 @@ class Slam:
         """Final optimisation; returns the pose of every scan. Raises SegslamError before the first scan.
 
         Loops are then searched again with the final poses, for at most `search_s` seconds. The adjustment of the whole
-        map follows, with `progress`.
+        map follows, with `progress`. Later calls return the same result.
         """
+        if self._result is not None:
+            return self._result
         if not self._steps:
             raise SegslamError("no scan was processed; give at least one that can be used before `finish`")
         self._is_finished = True
@@ -178,7 +185,7 @@ class Slam:
             after_break=np.array([self._motions[row].is_break for row in self._keyframe_rows]),
         )
         alone = self._tracker.alone()[: len(odometry)]  # tracking may be ahead when a run is stopped
-        return SlamResult(
+        self._result = SlamResult(
             replace(odometry, T_world_lidar=T_world_lidar),
             odometry,
             estimate if adjusted is None else adjusted.after,
@@ -189,6 +196,7 @@ class Slam:
             adjusted=adjusted,
             alone=replace(odometry, T_world_lidar=np.stack(alone)) if len(alone) == len(odometry) else None,
         )
+        return self._result
 
     def _settle(self, end_s: float) -> tuple[GraphEstimate, list[LoopAttempt]]:
         """The final estimate, after a second search for loops with better poses; and the attempts of that search.
@@ -256,7 +264,11 @@ class Slam:
     def _cut(self, tracked: Tracked, registered: OdometryResult) -> Keyframe:
         """A keyframe of this scan, downsampled; geometric labels are computed if it has none."""
         with tracked.watch("label"):
-            labels = computed(registered.labels)
+            try:
+                labels = computed(registered.labels)
+            except BadScan as error:  # the scan is part of the drive already
+                logger.warning("%s; its labels are left out", error)
+                labels = np.zeros(len(registered.points), np.uint8)
             is_unlabelled = not labels.any()
             if is_unlabelled:
                 labels = (self._labeller or geometric_labels)(registered.points)

@@ -100,3 +100,11 @@ def test_points_on_the_borders_of_voxels_are_in_the_same_ones_for_poses_that_dif
         return surfaces_of(lambda _: points, T_world, np.zeros(2), config=RefineConfig())(0).points
 
     np.testing.assert_allclose(made(moved_m=1e-13), made(moved_m=0.0), atol=1e-9)
+
+
+def test_the_information_of_surfaces_without_any_noise_is_finite() -> None:
+    level = np.stack(np.meshgrid(np.arange(-8.0, 8.0, 0.25), np.arange(-8.0, 8.0, 0.25), [0.0]), axis=-1).reshape(-1, 3)
+    surface = surfaces_of(lambda _: level.astype(np.float32), np.eye(4)[None], np.zeros(1), config=RefineConfig())(0)
+    found = align(surface, surface, np.eye(4))
+    assert found is not None
+    assert np.isfinite(found.information).all()

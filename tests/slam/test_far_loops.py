@@ -11,19 +11,27 @@ from helpers.drives import drifting, round_drive
 from segslam.candidates.proximity import LEAST_PROBABILITY
 from segslam.core import geometry
 from segslam.core.config import OdometryConfig, load_config
+from segslam.core.threads import Stopwatch
 from segslam.core.types import (
     Alignment,
     LoopAttempt,
     LoopClosure,
     Motion,
     MotionState,
+    Registration,
     Rejected,
     RejectReason,
     Scan,
     Trajectory,
+    Transform,
 )
+from segslam.graph import PoseGraph
 from segslam.odometry.sweep import GivenOdometry, OdometryResult
 from segslam.registration.prepared import PreparedScan
+from segslam.slam import far_loops, loops
+from segslam.slam.loop_edits import NO_EDITS
+from segslam.slam.loops import LoopCloser
+from segslam.slam.recognition import Recognised
 from segslam.slam.slam import Slam
 from segslam.slam.slam_result import SlamResult
 from segslam.verification import register_prepared
@@ -191,3 +199,48 @@ def test_a_loop_across_a_break_waits_for_two_others() -> None:
 def _from_first(truth: Trajectory) -> np.ndarray:
     """(n, 3) positions in the frame of the first scan."""
     return (geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar)[:, :3, 3]
+
+
+@pytest.mark.long
+def test_a_loop_that_waits_after_the_search_by_distance_is_not_tried_by_appearance_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A second lap of 1.6 km, 13 m beside the first by the odometry; every registration is right."""
+    corners_m, side_m, step_m = np.array([[0, 0], [400, 0], [400, 400], [0, 400]]), 400.0, 2.0
+
+    def true_pose(number: int) -> Transform:
+        side, along_m = divmod(step_m * number % (4 * side_m), side_m)
+        turn = geometry.yaw(0.5 * np.pi * side)
+        return geometry.transform(turn, [*(corners_m[int(side)] + along_m * turn[:2, 0]), 0.0])
+
+    def alignment(source: int, target: int, gate: Any) -> Alignment | Rejected:
+        T_target_source = geometry.inverse(true_pose(target)) @ true_pose(source)
+        information = np.diag([1e6] * 3 + [1e4] * 3)
+        found = Registration(T_target_source, 100, 100, 0.01, information)
+        excluded = gate(T_target_source, slack_m=0.0)
+        return Alignment(found, found, 0.9, 0.05, 0.0, probability=0.99) if excluded is None else excluded
+
+    def recognised(scan: Any, places: Any, *_: Any, gate: Any, **__: Any) -> Recognised | Rejected:
+        found = alignment(scan, places[0].place_id, gate(places[0].place_id))
+        return found if isinstance(found, Rejected) else Recognised(places[0].place_id, np.eye(4), found)
+
+    monkeypatch.setattr(loops, "register_prepared", lambda source, target, gate, **_: alignment(source, target, gate))
+    monkeypatch.setattr(loops, "at_once", lambda *calls: tuple(call() for call in calls))
+    monkeypatch.setattr(far_loops, "recognise", recognised)
+    config = load_config(None)
+    graph = PoseGraph(config.graph)
+    no_points = np.zeros((0, 3), np.float32), np.zeros(0, np.uint8)
+    closer = LoopCloser(config, graph, lambda _: no_points, lambda _: no_points[1], NO_EDITS, is_known=False)
+    monkeypatch.setattr(closer, "_prepared", lambda number: number)
+    monkeypatch.setattr(closer._far, "_prepared", lambda number: number)
+    rng = np.random.default_rng(1)
+    seen = [rng.integers(0, 255, 24 * 60, dtype=np.uint8).tobytes() for _ in range(800)]
+    closed: list[tuple[int, int]] = []
+    for number in range(803):
+        T_odom = geometry.transform(np.eye(3), [0.0, 13.0 * number / 800, 0.0]) @ true_pose(number)
+        graph.add_keyframe(number, T_odom, step_m * number)
+        closer.add(T_odom, labelled_by_shape=False, recorded=seen[number % 800])
+        attempts = closer.attempt(number, Stopwatch())
+        closed += [one.candidate.pair for one in attempts if isinstance(one.outcome, LoopClosure)]
+    assert len(closed) >= 3
+    assert len(closed) == len(set(closed))

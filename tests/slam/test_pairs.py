@@ -79,3 +79,10 @@ def test_pairs_are_sorted_by_source_and_too_short_a_drive_has_none() -> None:
     pairs = all_pairs(T_world, travel_m, known, min_travel_m=50.0)
     assert (np.diff(pairs[:, 1]) >= 0).all()
     assert all_pairs(T_world[:2], travel_m[:2], known, min_travel_m=50.0).shape == (0, 2)
+
+
+def test_no_submap_is_paired_with_itself_or_a_later_one() -> None:
+    T_world, travel_m = there_and_back()
+    pairs = pairs_between_passes(T_world, travel_m, min_travel_m=0.0)
+    assert len(pairs)
+    assert (pairs[:, 0] < pairs[:, 1]).all()

@@ -12,7 +12,8 @@ from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.points import voxel_first
 from segslam.core.types import Alignment, LoopClosure, Registration
-from segslam.graph import PoseGraph
+from segslam.graph import Edge, PoseGraph
+from segslam.graph.levenberg_marquardt import Unsolvable
 from segslam.slam.adjustment import Adjusted, Velocities, adjust, rounds
 
 STEP_M = 2.0
@@ -126,3 +127,30 @@ def test_no_time_leaves_the_graph_unchanged() -> None:
 def test_keyframes_without_points_are_not_adjusted() -> None:
     made = graph()
     assert adjust(made, made.finish(), lambda _: np.empty((0, 3), np.float32), STILL, config=CONFIG) is None
+
+
+def test_a_graph_that_cannot_be_solved_with_the_submaps_stays_as_it_is(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def unsolvable(*_: object, **__: object) -> None:
+        raise Unsolvable("indefinite")
+
+    made = graph()
+    before = made.finish()
+    monkeypatch.setattr(made, "adjust", unsolvable)
+    assert adjust(made, before, points, STILL, config=CONFIG) is None
+    assert "the whole map is not adjusted: indefinite" in caplog.text
+
+
+def test_an_adjustment_is_dropped_to_the_last_final_optimisation() -> None:
+    made = graph()
+    made.finish()
+    measured = [Edge(one, one + 5, geometry.inverse(T_TRUE[one]) @ T_TRUE[one + 5], 1e6 * np.eye(6)) for one in (0, 5)]
+    made.adjust(measured)
+    registration = Registration(geometry.inverse(T_TRUE[0]) @ T_TRUE[30], 9, 9, 0.01, 1e6 * np.eye(6))
+    made.add_closure(LoopClosure.of(30, 0, Alignment(registration, registration, 0.9, 0.1, 0.0)))
+    made.finish()
+    last = made.T_world_keyframes.copy()
+    made.adjust(measured)
+    made.drop_adjustment()
+    np.testing.assert_array_equal(made.T_world_keyframes, last)

@@ -1,5 +1,6 @@
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -148,3 +149,21 @@ def test_no_scan_is_taken_after_the_end() -> None:
     slam.finish()
     with pytest.raises(SegslamError, match="scan 1: the run is finished"):
         slam.process(scans[1])
+
+
+def test_a_scan_whose_labels_cannot_be_read_remains_in_the_drive() -> None:
+    def cut() -> np.ndarray:
+        raise BadScan("labels of scan 1: cut")
+
+    slam = drifting_slam()
+    for scan in round_drive()[0][:3]:
+        slam.process(replace(scan, labels=cut) if scan.index == 1 else scan)
+    result = slam.finish()
+    assert result.trajectory.scan_index.tolist() == [0, 1, 2]
+    assert result.trajectory.scan_index[result.keyframe_rows].tolist() == [0, 1, 2]
+
+
+def test_the_end_comes_once() -> None:
+    slam = drifting_slam()
+    slam.process(round_drive()[0][0])
+    assert slam.finish() is slam.finish()

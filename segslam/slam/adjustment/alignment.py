@@ -36,6 +36,8 @@ MOST_POINTS = 3000
 """Chosen: number of points of the source, evenly among all."""
 MIN_PAIRED = 100
 """Chosen: fewer pairs of points do not determine a pose."""
+LEAST_VARIANCE = float(np.finfo(float).eps)
+"""Residuals (m^2) of made scenes without any noise are 0; the information of an alignment remains finite."""
 PointsOf = Callable[[int], Points]
 """Returns the points of a keyframe, by id, in its own frame."""
 Corrects = Callable[[int, Points], Float[np.ndarray, "m n 3"]]
@@ -83,7 +85,7 @@ def align(source: LightSurface, target: LightSurface, T_target_source: Transform
             break
     if length > SETTLED:
         return None
-    return Alignment(T_target_source, hessian / (squares / weights), num / len(points))
+    return Alignment(T_target_source, hessian / max(squares / weights, LEAST_VARIANCE), num / len(points))
 
 
 def _sample(source: LightSurface) -> tuple[Points, Points]:
@@ -151,7 +153,8 @@ def _of_pair(
     poses = np.linalg.lstsq(weighted @ pose, np.column_stack([weighted @ residual_m, coupling]))[0]
     gradient = coupling.T @ poses[:, 0] - columns.T @ (weights * residual_m)
     curvature = weights @ columns**2 - np.einsum("ij,ij->j", coupling, poses[:, 1:])
-    return np.array([gradient, curvature]) / float(weights @ residual_m**2 / weights.sum())
+    variance = float(weights @ residual_m**2 / weights.sum())
+    return np.array([gradient, curvature]) / max(variance, LEAST_VARIANCE)
 
 
 @kernel(

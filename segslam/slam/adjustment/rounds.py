@@ -21,6 +21,7 @@ from segslam.core.processes import in_parts
 from segslam.core.trajectory import Poses
 from segslam.core.types import GraphEstimate, Record
 from segslam.graph import Edge, PoseGraph
+from segslam.graph.levenberg_marquardt import Unsolvable
 from segslam.registration.refinement import INFORMATION_SCALE, limited_information
 from segslam.slam.adjustment.alignment import PointsOf
 from segslam.slam.adjustment.known import Known
@@ -227,7 +228,11 @@ def _rounds(
         registered = [one for one in tried if one is not None]
         if not registered:
             break
-        estimate, noise_factors = graph.adjust(registered, shared_within=shared_within)
+        try:
+            estimate, noise_factors = graph.adjust(registered, shared_within=shared_within)
+        except Unsolvable as why:
+            logger.warning("the whole map is not adjusted%s: %s", " further" * (number > 1), why)
+            break
         last = _Round(angle, len(pairs), registered, len(tried) == len(pairs), estimate, noise_factors)
         if not last.is_complete:
             break

@@ -112,7 +112,7 @@ def pairs_between_passes(T_world: Poses, travel_m: Vector, *, min_travel_m: floa
     near = cKDTree(places[:, :2]).query_ball_point(places[:, :2], RADIUS_M)
     pairs = []
     for row, rows in enumerate(near):
-        older = np.array(sorted(rows))
+        older = np.array(sorted(other for other in rows if other < row), dtype=np.int64)
         older = older[travel_m[nodes[row]] - travel_m[nodes[older]] >= min_travel_m]
         older = older[np.abs(places[older, 2] - places[row, 2]) < STOREY_M]
         for one in np.split(older, 1 + np.flatnonzero(np.diff(travel_m[nodes[older]]) >= min_travel_m)):

@@ -304,7 +304,7 @@ def test_a_second_call_leaves_the_work_of_the_first_alone(recordings: list[Path]
     assert foreign.exists()
 
 
-def test_what_is_kept_of_drives_is_not_that_of_drives_with_other_names(tmp_path: Path) -> None:
+def test_kept_results_belong_to_drives_of_these_names(tmp_path: Path) -> None:
     """Names become others when a drive of the same name is added."""
 
     def key_of(name: str) -> str:

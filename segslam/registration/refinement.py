@@ -142,8 +142,8 @@ def downsample(points: Points, *, config: RefineConfig) -> Points:
 
 
 def merge_clouds(clouds: Sequence[Points], *, config: RefineConfig) -> Points:
-    """Downsampled clouds of the same frame merged: the mean point of each voxel, float64: rounding would not repeat."""
-    return voxel_means(np.vstack(clouds), config.voxel_m)
+    """Downsampled clouds of the same frame merged: the mean point of each voxel, float32."""
+    return voxel_means(np.vstack(clouds), config.voxel_m).astype(np.float32)
 
 
 def make_surface(downsampled: Points, *, config: RefineConfig) -> Surface:

@@ -85,7 +85,7 @@ def made_result(steps: list[Step]) -> tuple[GraphEstimate, Trajectory]:
 
 
 def write_log(path: Path, steps: list[Step], config: Config = CONFIG) -> Path:
-    with LogWriter(path, config=config, dataset="kitti/00") as log:
+    with LogWriter(path, config=config, dataset="kitti/00", replaces=True) as log:
         for step in steps:
             log.write(step)
     return path

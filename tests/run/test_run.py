@@ -91,3 +91,10 @@ def test_a_log_that_is_being_written_is_not_replaced(tmp_path: Path) -> None:
         with pytest.raises(SegslamError, match="another process writes it"):
             log.move(tmp_path / "log.mcap")
         assert (tmp_path / "log.mcap").read_bytes() == before
+
+
+def test_a_log_takes_a_name_that_is_free(tmp_path: Path) -> None:
+    """The log that is resumed may have been removed meanwhile."""
+    with LogWriter(tmp_path / "log.mcap.part", config=Config(), dataset="resumed") as log:
+        log.move(tmp_path / "log.mcap")
+    assert [file.name for file in tmp_path.iterdir()] == ["log.mcap"]

@@ -190,7 +190,7 @@ class LogWriter:
         """
         try:
             os.fsync(self._output.raw.fileno())
-            if is_being_written(path):
+            if path.exists() and is_being_written(path):
                 raise SegslamError(f"{path}: another process writes it; wait for its end")
             self._path.replace(path)
         except OSError as error:

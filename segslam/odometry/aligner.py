@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from kiss_icp.config.parser import KISSConfig
 from kiss_icp.kiss_icp import KissICP
+from kiss_icp.registration import Registration
 
 from segslam.core.memory import keep_freed_memory
 from segslam.core.types import Points, Transform
@@ -19,17 +20,18 @@ from segslam.core.types import Points, Transform
 class KissAligner:
     """Aligns consecutive sweeps with KISS-ICP's map of the previous ones.
 
-    Its threads sum in any order: poses repeat to 1e-9 m, with one thread exactly.
+    Its threads sum in any order, so its poses repeat to 1e-12 m only. They are rounded before anything depends on them,
+    to a tenth of the step (m, rad) at which its iteration ends: poses are the same in each run.
     """
 
     def __init__(self, config: KISSConfig) -> None:
         self._config = config
-        self._kiss = self._first = KissICP(config)
+        self._kiss = self._first = _kiss(config)
         self._alone: list[Transform] = []
 
     def follow(self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform) -> None:
         """As `Odometry.follow`: the previous state is discarded."""
-        self._kiss = kiss = KissICP(self._config)
+        self._kiss = kiss = _kiss(self._config)
         for T_odom_scan, points in scans:
             kiss.local_map.update(points.astype(np.float64), T_odom_scan)
         kiss.last_pose = np.array(T_odom_lidar)
@@ -45,6 +47,24 @@ class KissAligner:
     def alone(self) -> list[Transform]:
         """The pose of each sweep passed to `align_alone`."""
         return self._alone
+
+
+class _Rounded(Registration):
+    def __init__(self, *, convergence_criterion: float, **settings: int) -> None:
+        super().__init__(convergence_criterion=convergence_criterion, **settings)
+        self._step = convergence_criterion / 10.0
+
+    def align_points_to_map(self, *args: Any, **keywords: Any) -> Transform:
+        T_odom_lidar = np.round(super().align_points_to_map(*args, **keywords) / self._step) * self._step
+        u, _, vt = np.linalg.svd(T_odom_lidar[:3, :3])
+        T_odom_lidar[:3, :3] = u @ vt
+        return T_odom_lidar
+
+
+def _kiss(config: KISSConfig) -> KissICP:
+    kiss = KissICP(config)
+    kiss.registration = _Rounded(**config.registration.model_dump())
+    return kiss
 
 
 def _registered(kiss: KissICP, points: Points, T_last_predicted: Transform) -> Transform:

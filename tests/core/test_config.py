@@ -94,9 +94,11 @@ def test_a_file_that_holds_no_settings_is_refused_by_name(tmp_path: Path, conten
         load_config(file, ["keyframes.distance_m=2"])
 
 
-def test_an_empty_file_means_the_defaults(tmp_path: Path) -> None:
-    (tmp_path / "empty.yaml").write_text("")
+@pytest.mark.parametrize("text", ["", "verify:\n  # max_false_share: 0.01\n"])
+def test_an_empty_file_or_section_means_the_defaults(tmp_path: Path, text: str) -> None:
+    (tmp_path / "empty.yaml").write_text(text)
     assert load_config(tmp_path / "empty.yaml") == Config()
+    assert load_config(tmp_path / "empty.yaml", ["verify.max_false_share=0.1"]).verify.max_false_share == 0.1
 
 
 def test_settings_that_users_need_are_the_first_of_their_sections_and_every_default_has_a_source() -> None:
@@ -122,6 +124,8 @@ def test_settings_that_users_need_are_the_first_of_their_sections_and_every_defa
         (f"odometry: {{max_range_m: {'x' * 5000}}}", r"odometry\.max_range_m: .* got 'x{79}\.\.\.$"),
         (f"odometry: {{max_range_m: 0x{'f' * 9000}}}", r"odometry\.max_range_m: .* got a int with too many digits"),
         (f"odometry: {{{'k' * 500}: 1}}", "unknown key odometry.k+"),
+        ("verify: 3", "verify: expected a section with keys, found 3$"),
+        ("3", "expected sections with keys, found 3$"),
     ],
 )
 def test_yaml_that_is_no_settings_is_refused_in_one_short_line(tmp_path: Path, text: str, complaint: str) -> None:

@@ -196,12 +196,10 @@ def config_from_yaml(text: str, source: str) -> Config:
     for name, section in _parse_yaml(text, source).items():
         if name not in Config.model_fields:
             gone.append(name)
-        elif isinstance(section, dict):
+        else:
             fields = type(getattr(Config(), name)).model_fields
             gone += [f"{name}.{key}" for key in section if key not in fields]
             known[name] = {key: value for key, value in section.items() if key in fields}
-        else:
-            known[name] = section
     if gone:
         more = f" and {len(gone) - MOST_NAMED} more" if len(gone) > MOST_NAMED else ""
         named = ", ".join(gone[:MOST_NAMED])
@@ -231,5 +229,8 @@ def _parse_yaml(text: str, source: str) -> dict[str, Any]:
     if values is None:
         return {}
     if not isinstance(values, dict):
-        raise SegslamError(f"{source}: expected sections with keys, found {type(values).__name__}")
-    return values
+        raise SegslamError(f"{source}: expected sections with keys, found {short(values)}")
+    for name, section in values.items():
+        if name in Config.model_fields and not isinstance(section, dict | None):
+            raise SegslamError(f"{source}: {name}: expected a section with keys, found {short(section)}")
+    return {name: {} if section is None else section for name, section in values.items()}

@@ -98,6 +98,8 @@ def locate(
     """
     for scan in scans:
         check_exists(scan, "give scan files")
+        if scan.is_dir():
+            raise SegslamError(f"{scan}: is a folder; give scan files, or use segslam localise for a folder of scans")
     label_files = [] if labels in LABEL_WORDS else [Path(labels) / f"{scan.stem}.label" for scan in scans]
     for file in label_files:
         check_exists(file, "--labels: give geometric, none, or a folder with a .label file for each scan")

@@ -205,7 +205,7 @@ def _edits(run: Path, forbid: list[str], add: list[str], *, add_near_fixes: bool
         raise SegslamError(f"nothing to edit: {remedy}")
     from segslam.output.log import read_log
 
-    recorded = read_log(run)
+    edits, recorded = LoopEdits(forbidden, added), read_log(run)
     if recorded.options.get("in_map"):
         raise SegslamError(f"{run}: localised in the map of another run, without loops of its own; edit that run")
     num = len(recorded.keyframes()[0])
@@ -217,4 +217,4 @@ def _edits(run: Path, forbid: list[str], add: list[str], *, add_near_fixes: bool
     tried = {attempt.candidate.pair for attempt in attempts}
     for newer, older in sorted(forbidden - tried):
         terminal.say(f"{newer}:{older}: {run} has not tried this loop; forbidden all the same (loops.csv has the ids)")
-    return LoopEdits(forbidden, added)
+    return edits

@@ -113,7 +113,7 @@ def _windows(placement: Placement, used: Mask) -> list[slice]:
 
     The gap is a share of the travel, with the fixes that remain as the whole.
     """
-    total_m = float(travelled_m(placement.T_enu_keyframe)[-1])
+    total_m = float(travelled_m(placement.matched.drive.T_map_lidar)[-1])
     gaps_m = np.diff([0.0, *placement.matched.travel_m[used], total_m])
     gap = min(float(gaps_m.max()) / max(total_m, 1e-9), MOST_HELD_OUT)
     share = float(np.clip(gap / (1.0 - gap), 1.0 / NUM_WINDOWS, MOST_HELD_OUT))

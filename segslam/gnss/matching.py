@@ -11,7 +11,7 @@ from segslam.gnss.fixes import Fixes
 from segslam.gnss.geodesy import Origin, enu_from_geodetic
 
 LONGEST_GAP_S = 2.0
-"""Chosen: a fix between two scans farther apart than this, or so long before the first scan, has no pose."""
+"""Chosen: a fix farther than this from every scan has no pose."""
 SPEED_OVER_S = 0.2
 """Chosen: time over which the velocity at a fix is measured."""
 
@@ -79,9 +79,10 @@ class Prepared:
         scan_s = 1e-9 * (drive.stamp_ns - begin)
         keyframe = nearest_rows(scan_s[drive.keyframe_rows], time_s)
         T_map_lidar = interpolated(drive, scan_s, time_s)
+        around_s = [np.clip(time_s + half_s, scan_s[0], scan_s[-1]) for half_s in (-SPEED_OVER_S / 2, SPEED_OVER_S / 2)]
         before, after = (
-            np.column_stack([np.interp(time_s + half_s, scan_s, axis) for axis in drive.T_map_lidar[:, :3, 3].T])
-            for half_s in (-SPEED_OVER_S / 2, SPEED_OVER_S / 2)
+            np.column_stack([np.interp(moment_s, scan_s, axis) for axis in drive.T_map_lidar[:, :3, 3].T])
+            for moment_s in around_s
         )
         return Matched(
             drive=drive,
@@ -91,7 +92,7 @@ class Prepared:
             keyframe=keyframe,
             T_map_lidar=T_map_lidar,
             T_keyframe_lidar=np.linalg.inv(drive.T_map_keyframe[keyframe]) @ T_map_lidar,
-            velocity=(after - before) / SPEED_OVER_S,
+            velocity=(after - before) / np.maximum(around_s[1] - around_s[0], 1e-9)[:, None],
             travel_m=np.interp(time_s, scan_s, travelled_m(drive.T_map_lidar)),
         )
 

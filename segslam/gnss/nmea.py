@@ -33,7 +33,9 @@ def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
     last = None
     for number, words in sentences.items():
         kind = words[0][-3:]
-        day = _date(words) or day
+        named = _date(words) or day
+        if named != day:  # the date has passed midnight already
+            day, last = named, None
         if kind not in found or len(words) < 10 or not words[1]:
             continue
         at = _time(file, number, words[1])

@@ -39,6 +39,8 @@ class FileProblem:
     """The edges of a file by their role."""
 
     num_vertices: int
+    num_fixed: int
+    """Vertices whose poses are given, at least one."""
     odometry: list[Edge]
     """Edges between consecutive ids; where several contradict each other, one without information."""
     closures: list[Edge]
@@ -57,12 +59,13 @@ class FileProblem:
         odometry += [replace(edges[0], information=noise.UNKNOWN_MOTION) for edges in groups]
         closures = [edge for edge in graph.edges if abs(edge.a - edge.b) != 1 or id(edge) in moved]
         each = 1.0 - (1.0 - noise.INLIER_PROBABILITY) / max(1, len(closures))
-        return cls(len(graph.T_world_vertex), odometry, closures, groups, noise.inlier_bound(each))
+        num_fixed = max(1, len(set(graph.fixed)))
+        return cls(len(graph.T_world_vertex), num_fixed, odometry, closures, groups, noise.inlier_bound(each))
 
     def redundancy(self, num_closures: int) -> int:
         """Degrees of freedom of odometry and so many closures beyond those of the poses."""
         num_edges = len(self.odometry) - len(self.contradicting) + num_closures
-        return noise.DEGREES_OF_FREEDOM * (num_edges - self.num_vertices + 1)
+        return noise.DEGREES_OF_FREEDOM * (num_edges - self.num_vertices + self.num_fixed)
 
     def undecided(self, kept: Mask) -> list[tuple[int, int]]:
         """The neighbours whose contradicting edges no kept closure across them decides."""

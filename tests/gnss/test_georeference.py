@@ -145,6 +145,25 @@ def test_held_out_windows_are_as_long_as_the_longest_part_without_fixes(first: i
     assert (windows[0].start, windows[-1].stop) == (0, NUM)
 
 
+def test_held_out_windows_compare_travels_of_the_same_poses() -> None:
+    """Four scans a keyframe, and the sensor shakes between them: the last quarter has no fixes."""
+    many = 4 * NUM
+    shaken = np.column_stack([np.linspace(0.0, 480.0, many), 0.5 * (np.arange(many) % 4 == 1), np.zeros(many)])
+    poses = np.stack([geometry.transform(np.eye(3), place) for place in shaken])
+    keyframes = np.arange(0, many, 4)
+    drive = Drive(np.arange(many) * 250_000_000, poses, keyframes)
+    placement = place(prepare(_fixes(poses[keyframes]), drive))
+    good = np.arange(len(placement.matched.rows)) < 180
+    windows = _windows(placement, good)
+    assert [window.stop - window.start for window in windows] == pytest.approx([NUM / 3] * 6, abs=0.03 * NUM)
+
+
+def test_the_speed_at_the_ends_of_a_drive_is_that_between_its_scans() -> None:
+    poses = np.stack([geometry.transform(np.eye(3), [STEP_M * row, 0.0, 0.0]) for row in range(NUM)])
+    matched = prepare(_fixes(poses), _drive(poses)).matched(0.0)
+    np.testing.assert_allclose(matched.velocity, np.tile([STEP_M / PERIOD_S, 0.0, 0.0], (NUM, 1)), atol=1e-9)
+
+
 def test_fixes_without_heights_place_a_drive_horizontally() -> None:
     truth = _truth()
     fixes = _fixes(truth)

@@ -334,6 +334,21 @@ def test_midnight_is_passed_without_a_fix(tmp_path: Path) -> None:
     assert np.diff(read_fixes(tmp_path / "a.nmea").stamp_ns) == [3_000_000_000]
 
 
+def test_a_date_that_passes_midnight_before_the_fix_counts_once(tmp_path: Path) -> None:
+    fix = "4800.0,N,00800.0,E,1,8,1,100,M,48,M,,"
+    sentences = (
+        "GPZDA,235959.00,31,01,2026,00,00",
+        f"GPGGA,235959.00,{fix}",
+        "GPZDA,000000.00,01,02,2026,00,00",
+        f"GPGGA,000000.00,{fix}",
+        f"GPGGA,000001.00,{fix}",
+    )
+    (tmp_path / "a.nmea").write_text("\n".join(map(sentence, sentences)))
+    fixes = read_fixes(tmp_path / "a.nmea")
+    assert fixes.stamp_ns[-1] == stamp_of(datetime(2026, 2, 1, 0, 0, 1, tzinfo=UTC))
+    assert np.diff(fixes.stamp_ns).tolist() == [1_000_000_000] * 2
+
+
 def test_blanks_before_a_sentence_are_ignored(tmp_path: Path) -> None:
     (tmp_path / "a.log").write_text(" " + sentence("GPGGA,235958.00,4800.0,N,00800.0,E,1,8,1,100,M,48,M,,") + "\n")
     assert read_fixes(tmp_path / "a.log").places.tolist() == [[48.0, 8.0, 148.0]]

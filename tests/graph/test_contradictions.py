@@ -67,6 +67,16 @@ def test_a_kept_edge_that_fits_far_worse_than_the_others_is_reported_though_all_
     assert "the edge from 9 to 10 is kept with a chi-square of 4" in reported
 
 
+def test_fixed_vertices_add_degrees_of_freedom() -> None:
+    graph, _ = ring()
+    poses, edges = graph.T_world_vertex, [edge for edge in graph.edges if edge.b == edge.a + 1]
+    assert optimize_graph(G2oGraph(poses, edges, fixed=(0,))).chi2_per_dof is None
+    both = optimize_graph(G2oGraph(poses, edges, fixed=(0, len(edges))))
+    all_three = optimize_graph(G2oGraph(poses, edges, fixed=(0, 5, len(edges))))
+    for found, fixed in ((both, 2), (all_three, 3)):
+        assert found.chi2_per_dof == pytest.approx(2.0 * found.final_error / (6 * (fixed - 1)), rel=1e-6)
+
+
 def test_repeated_edges_that_agree_are_odometry() -> None:
     graph, _ = ring()
     assert contradicting([graph.edges[3], backwards(graph.edges[3]), false_edge(graph.edges[3], 0.1)]) == []

@@ -150,6 +150,13 @@ def test_bad_usage_of_the_command_is_one_line(
     assert output in capsys.readouterr().err
 
 
+def test_a_folder_is_no_scan(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert commands.run("locate", run, tmp_path) == 2
+    assert capsys.readouterr().err == (
+        f"segslam: {tmp_path}: is a folder; give scan files, or use segslam localise for a folder of scans\n"
+    )
+
+
 def test_labels_of_unknown_numbering_are_refused_with_the_remedy(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

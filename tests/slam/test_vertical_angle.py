@@ -13,7 +13,8 @@ from segslam.core import geometry
 from segslam.core.config import RefineConfig, SensorCalibrationConfig
 from segslam.core.geometry import raise_beams
 from segslam.registration import refinement
-from segslam.slam.adjustment.alignment import MIN_PAIRS
+from segslam.slam.adjustment import vertical_angle
+from segslam.slam.adjustment.alignment import MIN_PAIRS, Shown
 from segslam.slam.adjustment.vertical_angle import (
     BIAS_DEG,
     VerticalAngle,
@@ -99,6 +100,21 @@ def test_a_small_angle_is_as_uncertain_as_a_large_one() -> None:
     assert abs(small.angle_deg) < 0.02
     assert small.sigma_deg >= BIAS_DEG
     assert small.correction_deg == 0.0
+
+
+def test_an_angle_that_few_pairs_hardly_show_is_not_significant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What 17 pairs show within 20 m of a campus: less than two standard deviations, and nothing after 0.26 degrees."""
+    seen_deg = iter([(-0.113, 0.061), (-0.047, 0.042), (0.166, 0.038)])
+    one = np.ones(1)
+    monkeypatch.setattr(
+        vertical_angle,
+        "shown",
+        lambda *_: Shown(*(one * value for value in next(seen_deg)), gain=one, num_pairs=17),
+    )
+    found = measured(np.arange(-30.0, 31.0, 2.0))
+    assert found is not None
+    assert found.angle_deg == pytest.approx(-0.26, abs=0.01)
+    assert not found.is_significant
 
 
 @pytest.mark.long

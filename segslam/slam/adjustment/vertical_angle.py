@@ -92,7 +92,8 @@ def measure_vertical_angle(
     """The vertical angle by pairs of submaps that are some metres apart; None if too few pairs determine it.
 
     An angle within `BIAS_DEG` is as they show it. Of a larger one they hide a part: it is the correction that leaves
-    none, by the method of secants, from no correction and `near_deg`, by default twice the angle that they show.
+    none, by the method of secants, from no correction and `near_deg`, by default twice the angle that they show. Its
+    error is that of the angle they show, enlarged as much: few pairs may lead far without a reason.
     `motion_variance` (n,): as of `is_known`, by default of exact poses.
     """
     variance = np.zeros(len(travel_m)) if motion_variance is None else motion_variance
@@ -111,9 +112,10 @@ def measure_vertical_angle(
     found = left_of(0.0)
     if found is None:
         return None
-    left_deg = float(found.value[0])
+    left_deg = shown_deg = float(found.value[0])
+    shown_sigma_deg = float(found.sigma[0])
     if abs(left_deg) < BIAS_DEG:
-        return VerticalAngle(left_deg, math.hypot(float(found.sigma[0]), BIAS_DEG), found.num_pairs)
+        return VerticalAngle(left_deg, math.hypot(shown_sigma_deg, BIAS_DEG), found.num_pairs)
     before_deg, correction_deg = 0.0, 2.0 * left_deg if near_deg is None else near_deg
     for _ in range(2):
         found, last_deg = left_of(correction_deg), left_deg
@@ -124,7 +126,8 @@ def measure_vertical_angle(
         before_deg, correction_deg = correction_deg, correction_deg + left_deg / share
         if abs(left_deg) < float(found.sigma[0]):
             break
-    return VerticalAngle(correction_deg, math.hypot(float(found.sigma[0]) / share, BIAS_DEG), found.num_pairs)
+    sigma_deg = math.hypot(shown_sigma_deg * correction_deg / shown_deg, BIAS_DEG)
+    return VerticalAngle(correction_deg, sigma_deg, found.num_pairs)
 
 
 class Calibrator:

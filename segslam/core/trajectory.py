@@ -76,6 +76,11 @@ def read_poses(path: Path, *, format: PoseFormat | None = None, skips_names: boo
     """
     lines = _number_lines(path)
     if skips_names and len(lines) > 1 and not re.match(r"[-+.\d]", lines[0][1][0]):
+        number, names = lines[0]
+        if any(name.lower().endswith("w") for name in names[4:-1]):
+            raise SegslamError(
+                f"{path}:{number}: its columns are {brief(' '.join(names))}; reorder them: {LAYOUT['tum']}"
+            )
         lines = lines[1:]
     first, fields = lines[0]
     chosen = format or next((name for name, columns in COLUMNS.items() if len(fields) == columns), None)

@@ -1,8 +1,10 @@
 """Paths as users give them, their texts, and atomic writing: a file appears when it is complete, or not at all."""
 
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from secrets import token_hex
 
 from segslam.core.errors import SegslamError, WorkFailed, brief, reason, unreadable
 from segslam.core.interrupts import removed_when_stopped
@@ -54,6 +56,18 @@ def whole_file(file: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)
+
+
+@contextmanager
+def temporary_folder(parent: Path, prefix: str) -> Iterator[Path]:
+    """Context manager with a new folder, which is removed at the end, also if a signal arrives while it is made."""
+    folder = parent / f"{prefix}{token_hex(4)}"
+    with removed_when_stopped(folder):
+        try:
+            folder.mkdir(mode=0o700)
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def write_whole(file: Path, content: bytes | str) -> None:

@@ -17,8 +17,9 @@ from segslam.core.types import SegslamError
 from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
 
 COLUMNS: dict[str, tuple[str, ...]] = {
-    "time": ("time", "t", "seconds", "timestamp", "stamp", "stamp_s", "time_s", "sec", "utc", "unix_time"),
+    "time": ("time", "t", "seconds", "timestamp", "stamp", "stamp_s", "time_s", "sec", "secs", "utc", "unix_time"),
     "time_ns": ("time_ns", "stamp_ns", "timestamp_ns", "nanoseconds"),
+    "fraction_ns": ("nanosec", "nanosecs", "nsec", "nsecs"),
     "latitude": ("latitude", "latitude_deg", "lat", "lat_deg"),
     "longitude": ("longitude", "longitude_deg", "lon", "lon_deg", "lng", "long"),
     "height": ("height", "height_m", "altitude", "altitude_m", "alt", "alt_m", "h", "ellipsoidal_height", "ele"),
@@ -100,8 +101,11 @@ def _row(file: Path, number: int, cells: Sequence[str], places: dict[str, int]) 
     both = value("sigma")
     east, north, up = (value(f"sigma_{axis}") for axis in ("east", "north", "up"))
     is_ns = "time_ns" in places
+    stamp_ns = _stamp(file, number, cell("time_ns" if is_ns else "time"), is_ns=is_ns)
+    if "fraction_ns" in places and not is_ns:
+        stamp_ns += _stamp(file, number, cell("fraction_ns"), is_ns=True)
     return Row(
-        _stamp(file, number, cell("time_ns" if is_ns else "time"), is_ns=is_ns),
+        stamp_ns,
         latitude,
         longitude,
         value("height"),
@@ -134,4 +138,4 @@ def _has_fix(text: str, least: float) -> bool:
     try:
         return float(text) >= least
     except ValueError:
-        return text not in ("false", "no", "none", "nofix", "no_fix", "v", "invalid")
+        return re.sub(r"[\s_-]", "", text) not in ("false", "no", "none", "nofix", "v", "invalid")

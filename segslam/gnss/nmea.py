@@ -1,9 +1,10 @@
 """Fixes from NMEA 0183: GGA (position, height, quality) and RMC (position, date); others only give the date (ZDA)."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, date, datetime, time, timedelta
 from functools import reduce
+from itertools import pairwise
 from operator import xor
 from pathlib import Path
 
@@ -28,8 +29,8 @@ def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
     num_wrong = len(all_words) - len(sentences)
     if not sentences:
         raise SegslamError(f"{file}: all {num_wrong} NMEA sentences have wrong checksums; log them again")
-    # Fixes before the first date are of the same day. Without RMC or ZDA the times are those of a day.
-    day = next(filter(None, map(_date, sentences.values())), date(1970, 1, 1))
+    # Without RMC or ZDA the times are those of a day.
+    day = next(filter(None, map(_date, sentences.values())), date(1970, 1, 1)) - _midnights_before_date(file, sentences)
     last = None
     for number, words in sentences.items():
         kind = words[0][-3:]
@@ -48,6 +49,17 @@ def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
         return found["RMC"], f"no heights{left_out}"
     heights = "altitude above the geoid and geoid separation, as the receiver gives them, added to ellipsoidal heights"
     return found["GGA"], f"heights: {heights}{left_out}"
+
+
+def _midnights_before_date(file: Path, sentences: Mapping[int, Sequence[str]]) -> timedelta:
+    """Days between the first sentence with a time and the first one with a date."""
+    times = []
+    for number, words in sentences.items():
+        if words[0][-3:] in ("GGA", "RMC", "ZDA") and len(words) > 1 and words[1]:
+            times.append(datetime.combine(date.min, _time(file, number, words[1])))
+        if _date(words) is not None:
+            return timedelta(days=sum(a - b > timedelta(hours=12) for a, b in pairwise(times)))
+    return timedelta()
 
 
 def _words(line: str) -> list[str] | None:

@@ -14,6 +14,7 @@ from segslam.core.trajectory import nanoseconds
 from segslam.core.types import (
     BadScan,
     Indices,
+    Mask,
     Points,
     Scan,
     ScanLabels,
@@ -88,7 +89,7 @@ class Dataset:
             stamp_ns,
             cloud.points,
             self.labels.read(file.stem, cloud.points, cloud.intensities),
-            sweep_times(cloud.times, len(cloud.points), stamp_ns * 1e-9),
+            times_of(cloud, stamp_ns),
             intensities=cloud.intensities if self._has_intensities else None,
             vertical_angle_deg=self.vertical_angle_deg,
         )
@@ -148,6 +149,27 @@ def no_topics(topic: str) -> SegslamError:
     return SegslamError(f"--topic {topic}: only recordings have topics (rosbag, mcap); omit the option")
 
 
+def times_of(cloud: Cloud, stamp_ns: int) -> Vector:
+    """`sweep_times` of the valid points of a cloud; the times of the others, which may be anything, are 0."""
+    kept = _is_return(cloud.points)
+    if len(cloud.times) != len(kept):
+        return NO_TIMES
+    found = sweep_times(cloud.times[kept], int(kept.sum()), stamp_ns * 1e-9)
+    if len(found) == 0:
+        return NO_TIMES
+    times = np.zeros(len(kept))
+    times[kept] = found
+    return times
+
+
+def _is_return(points: Points) -> Mask:
+    """True for points that are finite, as float32, and not the origin."""
+    with np.errstate(over="ignore", invalid="ignore"):  # wild numbers, and NaNs that signal
+        squared_range = squared_ranges(points.astype(np.float32, copy=False))
+    is_return: Mask = np.isfinite(squared_range) & (squared_range > 0)
+    return is_return
+
+
 def make_scan(
     source: Path,
     index: int,
@@ -167,8 +189,7 @@ def make_scan(
     """
     with np.errstate(over="ignore", invalid="ignore"):  # wild numbers, and NaNs that signal
         points = points.astype(np.float32, copy=False)
-        squared_range = squared_ranges(points)
-    kept = np.isfinite(squared_range) & (squared_range > 0)
+    kept = _is_return(points)
     if not kept.any():
         what = "has no points" if len(points) == 0 else f"none of its {len(points)} points is finite and not 0, 0, 0"
         raise BadScan(f"{source}: {what}; copy the file again, or leave this scan out")

@@ -9,6 +9,7 @@ import numpy as np
 
 from segslam.scans.clouds import from_columns
 from segslam.scans.dataset import Cloud
+from segslam.scans.scan_files import by_name
 
 KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Types of sensor_msgs/PointField by number."""
@@ -47,19 +48,21 @@ def read_message(message: Any) -> Cloud:
     of large offsets, and lets points overlap.
     """
     order = ">" if message.is_bigendian else "<"
-    formats = [np.dtype(order + KINDS[field.datatype]) for field in message.fields]
+    fields = [field for field in message.fields if field.datatype in KINDS]
+    formats = [np.dtype(order + KINDS[field.datatype]) for field in fields]
     height, width, step = message.height, message.width, message.point_step
     num_bytes = (height - 1) * message.row_step + width * step if height * width else 0
     overlap = not 0 < step < 2**31 or (height > 1 and message.row_step < width * step)
     if overlap or min(height, width) < 0 or num_bytes > len(message.data):
         raise ValueError(f"{height} x {width} points of {step} bytes do not fit into {len(message.data)} bytes of data")
-    for field, kind in zip(message.fields, formats, strict=True):
+    for field, kind in zip(fields, formats, strict=True):
         if not 0 <= field.offset <= step - kind.itemsize:
             raise ValueError(f"the field {field.name[:40]} at {field.offset} is not in a point of {step} bytes")
-    names, offsets = [field.name for field in message.fields], [field.offset for field in message.fields]
+    names, offsets = [str(number) for number in range(len(fields))], [field.offset for field in fields]
     dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
     rows = np.ndarray((height, width), dtype, buffer=message.data, strides=(message.row_step, step))
-    return replace(from_columns({name: rows[name].reshape(-1) for name in names}), stamp_ns=stamp_ns_of(message))
+    columns = by_name((field.name, rows[name].reshape(-1)) for field, name in zip(fields, names, strict=True))
+    return replace(from_columns(columns), stamp_ns=stamp_ns_of(message))
 
 
 def stamp_ns_of(message: Any) -> int:

@@ -96,7 +96,7 @@ def binary_columns(
     if num_rows == 0:
         raise ValueError(NO_POINTS)
     rows = np.frombuffer(content, row, num_rows, start)
-    return _by_name((field.name, rows[f"{k}"][:, 0]) for k, field in enumerate(fields) if field.num_values == 1)
+    return by_name((field.name, rows[f"{k}"][:, 0]) for k, field in enumerate(fields) if field.num_values == 1)
 
 
 def text_columns(content: bytes, start: int, num_rows: int, fields: Sequence[Field], *, is_last: bool) -> Columns:
@@ -105,16 +105,14 @@ def text_columns(content: bytes, start: int, num_rows: int, fields: Sequence[Fie
         raise ValueError(NO_POINTS)
     num_columns = sum(field.num_values for field in fields)
     wanted = num_rows * num_columns
-    if 2 * wanted > len(content) - start:
+    if 2 * wanted - 1 > len(content) - start:
         raise ValueError(
             f"it is truncated: its header claims {wanted} numbers, but {len(content) - start} bytes follow"
         )
     words = content[start:].split(None, wanted)
-    if (
-        len(words) < wanted
-        or (is_last and len(words) > wanted)
-        or (len(words) == wanted and not content[-1:].isspace())
-    ):
+    if len(words) == wanted and not content[-1:].isspace():
+        raise ValueError("its last line has no end, so its last number may be cut; add a line end if it is whole")
+    if len(words) < wanted or (is_last and len(words) > wanted):
         raise ValueError(f"it is truncated or damaged: its header claims {wanted} numbers, the file has {len(words)}")
     if content.find(b"_", start) >= 0:
         raise ValueError("its points contain a _, which is no part of a number")  # Python allows it
@@ -125,7 +123,7 @@ def text_columns(content: bytes, start: int, num_rows: int, fields: Sequence[Fie
     rows = numbers.reshape(num_rows, num_columns)
     ends = np.cumsum([field.num_values for field in fields])
     with np.errstate(over="ignore"):
-        return _by_name(
+        return by_name(
             (one.name, rows[:, end - 1].astype(np.float32 if one.dtype.str[1:] == "f4" else np.float64))
             for one, end in zip(fields, ends, strict=True)
             if one.num_values == 1
@@ -141,7 +139,7 @@ def check_size(num_bytes: int, expected: int, num_rows: int, *, tolerated: int |
         )
 
 
-def _by_name(columns: Iterable[tuple[str, np.ndarray]]) -> Columns:
+def by_name(columns: Iterable[tuple[str, np.ndarray]]) -> Columns:
     """The columns by name. Padding may have a name several times."""
     named: Columns = {}
     for name, values in columns:

@@ -12,9 +12,22 @@ from helpers.made_logs import largest_file
 
 from segslam.core.geometry import transform, yaw
 from segslam.core.types import SegslamError, WorkFailed
-from segslam.core.whole_files import whole_file, write_whole
+from segslam.core.whole_files import temporary_folder, whole_file, write_whole
 from segslam.graph.edges import Edge
 from segslam.graph.g2o import G2oGraph, write_g2o
+
+
+def test_a_signal_while_a_temporary_folder_is_made_leaves_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mkdir = os.mkdir
+
+    def interrupted(*arguments: object, **keywords: object) -> None:
+        mkdir(*arguments, **keywords)  # type: ignore[arg-type]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "mkdir", interrupted)
+    with pytest.raises(KeyboardInterrupt), temporary_folder(tmp_path, ".map-"):
+        pass
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture

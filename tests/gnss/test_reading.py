@@ -349,6 +349,30 @@ def test_a_date_that_passes_midnight_before_the_fix_counts_once(tmp_path: Path) 
     assert np.diff(fixes.stamp_ns).tolist() == [1_000_000_000] * 2
 
 
+def test_fixes_before_the_first_date_may_be_of_the_day_before(tmp_path: Path) -> None:
+    fix = "4800.0,N,00800.0,E,1,8,1,100,M,48,M,,"
+    sentences = (
+        f"GPGGA,235958.00,{fix}",
+        f"GPGGA,000000.00,{fix}",
+        "GPRMC,000000.00,A,4800.0,N,00800.0,E,0,0,310124,,",
+        f"GPGGA,000001.00,{fix}",
+    )
+    (tmp_path / "a.nmea").write_text("\n".join(map(sentence, sentences)))
+    fixes = read_fixes(tmp_path / "a.nmea")
+    assert fixes.stamp_ns[0] == stamp_of(datetime(2024, 1, 30, 23, 59, 58, tzinfo=UTC))
+    assert np.diff(fixes.stamp_ns).tolist() == [2_000_000_000, 1_000_000_000]
+
+
+def test_seconds_and_nanoseconds_may_be_two_columns(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("sec,nanosec,lat,lon\n100,0,48,11\n100,500000000,48.1,11\n101,0,48.2,11\n")
+    assert read_fixes(tmp_path / "a.csv").stamp_ns.tolist() == [100_000_000_000, 100_500_000_000, 101_000_000_000]
+
+
+def test_no_fix_may_be_written_with_a_blank(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("time,lat,lon,fix\n1,48,11,no fix\n2,48,11,RTK fix\n3,48,11,No-Fix\n")
+    assert read_fixes(tmp_path / "a.csv").reasons == ("no_fix", "", "no_fix")
+
+
 def test_blanks_before_a_sentence_are_ignored(tmp_path: Path) -> None:
     (tmp_path / "a.log").write_text(" " + sentence("GPGGA,235958.00,4800.0,N,00800.0,E,1,8,1,100,M,48,M,,") + "\n")
     assert read_fixes(tmp_path / "a.log").places.tolist() == [[48.0, 8.0, 148.0]]

@@ -69,6 +69,13 @@ def test_camera_and_lidar_frames_are_those_of_kitti(tmp_path: Path) -> None:
     assert not (tmp_path / "no.txt").exists()
 
 
+def test_columns_in_another_order_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.csv").write_text("timestamp,x,y,z,qw,qx,qy,qz\n0,0,0,0,1,0,0,0\n1,1,0,0,0.8,0.6,0,0\n")
+    assert run("convert", tmp_path / "a.csv", tmp_path / "a.tum") == 2
+    assert "a.csv:1: its columns are timestamp x y z qw qx qy qz; reorder them: TUM" in capsys.readouterr().err
+    assert not (tmp_path / "a.tum").exists()
+
+
 def test_the_command_converts_and_does_not_replace(
     tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -228,3 +228,11 @@ def test_numbers_in_text_are_those_of_python(form: str) -> None:
 def test_text_that_is_no_number_is_refused(word: str) -> None:
     with pytest.raises(ValueError, match=r"number|convert"):
         _column(f"1 {word} 2\n", 3)
+
+
+@pytest.mark.parametrize("last", [b"9", b"9.125"])
+def test_a_text_without_a_last_line_end_may_be_cut(tmp_path: Path, last: bytes) -> None:
+    fields = [Field(name, np.dtype("f4"), 1) for name in "xyz"]
+    assert len(text_columns(b"1 2 3\n4 5 6\n7 8 9\n", 0, 3, fields, is_last=True)["x"]) == 3
+    with pytest.raises(ValueError, match="its last line has no end, so its last number may be cut"):
+        text_columns(b"1 2 3\n4 5 6\n7 8 " + last, 0, 3, fields, is_last=True)

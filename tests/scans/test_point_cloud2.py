@@ -46,3 +46,15 @@ def test_points_outside_of_the_data_are_refused(changed: dict[str, Any]) -> None
 
 def test_a_message_without_points_has_none() -> None:
     assert len(read_message(_message(height=0, width=0, data=b"")).points) == 0
+
+
+def test_padding_may_have_a_name_twice_or_a_datatype_of_its_own() -> None:
+    padding = [SimpleNamespace(name="_", offset=at, datatype=kind, count=1) for at, kind in ((8, 2), (9, 2), (0, 99))]
+    np.testing.assert_array_equal(
+        read_message(_message(fields=[*FIELDS, *padding])).points, np.arange(30.0).reshape(10, 3)
+    )
+
+
+def test_a_coordinate_given_twice_is_refused() -> None:
+    with pytest.raises(ValueError, match="has the field x twice"):
+        read_message(_message(fields=[*FIELDS, FIELDS[0]]))

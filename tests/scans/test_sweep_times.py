@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from segslam.scans.dataset import Cloud, times_of
 from segslam.scans.scan_files import sweep_times
 
 SHARES = np.linspace(0.125, 0.875, 7)  # nothing is seen in the first and the last eighth of the turn
@@ -40,3 +41,18 @@ def test_a_full_sweep_begins_at_0_and_ends_within_the_period() -> None:
 )
 def test_missing_times_give_none(times: list[float], num_points: int) -> None:
     assert len(sweep_times(np.array(times), num_points, 0.0)) == 0
+
+
+@pytest.mark.parametrize("invalid", [0.0, np.nan, -1e30])
+def test_times_of_points_without_return_do_not_matter(invalid: float) -> None:
+    points = np.ones((8, 3), np.float32)
+    points[[2, 5]] = [[np.nan, 1.0, 1.0], [0.0, 0.0, 0.0]]
+    stamp_s = 1.7e9
+    times = stamp_s + 0.1 * np.linspace(0.0, 0.999, 8)
+    expected = times_of(Cloud(points, times), round(1e9 * stamp_s))
+    times[[2, 5]] = invalid
+    found = times_of(Cloud(points, times), round(1e9 * stamp_s))
+    kept = [0, 1, 3, 4, 6, 7]
+    np.testing.assert_array_equal(found[kept], expected[kept])
+    np.testing.assert_allclose(found[kept], np.linspace(0.0, 0.999, 8)[kept], atol=1e-5)
+    assert np.isfinite(found).all()

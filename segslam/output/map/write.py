@@ -11,7 +11,6 @@ from contextlib import ExitStack
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,10 +18,9 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.config import MapConfig
 from segslam.core.extras import how_to_install
-from segslam.core.interrupts import removed_when_stopped
 from segslam.core.points import within_range
 from segslam.core.types import Keyframe, Label, Points, SegslamError, Transform, Vector
-from segslam.core.whole_files import check_target, whole_file
+from segslam.core.whole_files import check_target, temporary_folder, whole_file
 from segslam.labels.encodings import of_classes
 from segslam.output.map.clouds import BinaryCloud, LasCloud, PcdCloud, PlyCloud
 from segslam.output.map.from_above import BESIDE_M, cut_heights, free_heights
@@ -107,8 +105,7 @@ def write_map(
     SegslamError for another extension, a missing folder, or if no keyframe has a point, OSError if the disk is full.
     """
     check_files(files, origin=origin)
-    with TemporaryDirectory(dir=files[0].parent, prefix=".map-") as name, removed_when_stopped(Path(name)):
-        scratch = Path(name)
+    with temporary_folder(files[0].parent, ".map-") as scratch:
         store = MapStore(scratch, config, origin)
         for keyframe, T_world_keyframe in placed:
             store.add(keyframe, T_world_keyframe)

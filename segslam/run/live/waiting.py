@@ -12,8 +12,7 @@ from time import monotonic
 import numpy as np
 
 from segslam.core.types import BadScan, Scan, Transform
-from segslam.scans.dataset import Cloud, make_scan
-from segslam.scans.scan_files import sweep_times
+from segslam.scans.dataset import Cloud, make_scan, times_of
 
 MOST_WAITING = 4
 """Chosen: at 10 Hz, waiting then adds at most 0.4 s to the latency."""
@@ -191,7 +190,7 @@ class Source:
             stamp_ns,
             cloud.points,
             np.zeros(len(cloud.points), np.uint8),
-            sweep_times(cloud.times, len(cloud.points), 1e-9 * (cloud.stamp_ns or stamp_ns)),
+            times_of(cloud, cloud.stamp_ns or stamp_ns),
             intensities=cloud.intensities if self._has_intensities else None,
             vertical_angle_deg=self._vertical_angle_deg,
         )

@@ -187,6 +187,10 @@ def _loader(kind: str, source: Path, sequence: str, topic: str) -> Any:
             from segslam.scans.ouster import OusterFrames
 
             return OusterFrames(source)
+        case "nclt":
+            from segslam.scans.nclt import NcltDay
+
+            return NcltDay(source)
     from kiss_icp.datasets import dataset_factory
 
     with contextlib.redirect_stderr(io.StringIO()):  # here alone: warnings of our own readers are for the user

@@ -17,6 +17,7 @@ from segslam.cli.console import FirstOfEachKind, say
 from segslam.core.errors import SegslamError, reason
 from segslam.core.interrupts import EXIT_STATUS, ctrl_c_in_order, stop_line
 from segslam.core.memory import keep_freed_memory
+from segslam.core.whole_files import settle
 
 BAD_INPUT = 2
 
@@ -80,6 +81,7 @@ def _status(arguments: list[str] | None) -> int:
         say(f"segslam: {_of_file(error)}")
     finally:
         warnings.print_counts()
+        settle()
     return _flushed(BAD_INPUT)
 
 

@@ -1,6 +1,5 @@
 """Checks before a command begins: its input exists, a run can be resumed, nothing is replaced unasked; presets."""
 
-import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -9,7 +8,7 @@ from segslam.cli.console import Terminal
 from segslam.cli.dry_run import first_usable
 from segslam.cli.options import Settings
 from segslam.core.errors import SegslamError
-from segslam.core.whole_files import check_target
+from segslam.core.whole_files import check_target, set_aside
 
 if TYPE_CHECKING:
     from segslam.core.config import Config
@@ -81,7 +80,10 @@ def make_folder(
     inputs: Iterable[Path | None] = (),
     made_by: tuple[str, ...] = ("log.mcap", "log.mcap.part"),
 ) -> Path:
-    """Create the folder of a new run, as `new_folder`; with `overwrite` an earlier run there is removed before.
+    """Create the folder of a new run, as `new_folder`; with `overwrite` an earlier run there is replaced.
+
+    It is removed with the first step of the new one, or at the end of the command, which puts it back if nothing was
+    made instead.
 
     Raises SegslamError for a folder that is no run (it has none of the files `made_by`), for a run in progress, and if
     the new run is made from files in it.
@@ -99,7 +101,9 @@ def make_folder(
             raise SegslamError(f"{folder}: contains the input {path}; give another --out")
     if any(log.is_file() and is_being_written(log) for log in logs):
         raise SegslamError(f"{folder}: the run is still in progress; stop it, or give another --out")
-    shutil.rmtree(folder)
+    if _holds(folder, Path.cwd()):
+        raise SegslamError(f"{folder}: holds the present folder; change to another one, or give another --out")
+    set_aside(folder)
     return new_folder(folder)
 
 

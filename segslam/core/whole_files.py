@@ -70,6 +70,33 @@ def temporary_folder(parent: Path, prefix: str) -> Iterator[Path]:
             shutil.rmtree(folder, ignore_errors=True)
 
 
+_ASIDE: dict[Path, Path] = {}
+"""Folders that are to be replaced, and where their content is meanwhile."""
+
+
+def set_aside(folder: Path) -> None:
+    """Rename a folder, so that a new one can take its place; `settle` decides between the two."""
+    whole = folder.resolve()
+    aside = whole.with_name(f".{whole.name}.replaced")
+    shutil.rmtree(aside, ignore_errors=True)  # of a command that was killed
+    whole.rename(aside)
+    _ASIDE[whole] = aside
+
+
+def settle(folder: Path | None = None) -> None:
+    """Remove what was set aside for a folder, by default for all; where nothing was made instead, put it back."""
+    for whole in [*_ASIDE] if folder is None else [folder.resolve()]:
+        aside = _ASIDE.pop(whole, None)
+        if aside is None:
+            continue
+        with suppress(OSError):
+            whole.rmdir()  # if it is empty
+        if whole.exists():
+            shutil.rmtree(aside, ignore_errors=True)
+        else:
+            aside.rename(whole)
+
+
 def write_whole(file: Path, content: bytes | str) -> None:
     """Write a file atomically; text in UTF-8."""
     with whole_file(file) as part:

@@ -21,7 +21,7 @@ from segslam.core.memory import give_back, peak_mb
 from segslam.core.threads import in_other_thread
 from segslam.core.trajectory import travelled_m
 from segslam.core.types import BadScan, CloudOf, MotionState, Scan, SegslamError, Step, Trajectory, Transform
-from segslam.core.whole_files import write_whole
+from segslam.core.whole_files import settle, write_whole
 from segslam.graph import PoseGraph
 from segslam.output.accuracy import accuracy
 from segslam.output.finished import read_metrics
@@ -352,6 +352,8 @@ class Run:
         started = perf_counter()
         self._log.write(step)
         self.num_steps += 1
+        if self.num_steps == 1:
+            settle(self.folder)
         if self.num_steps % TRIM_EVERY == 0:
             give_back()  # or gaps of freed memory add up over a drive
         while self._unreported:

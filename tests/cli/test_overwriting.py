@@ -3,6 +3,7 @@
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.commands import run
 from helpers.drives import write_kitti_sequence
@@ -129,3 +130,21 @@ def test_a_folder_with_other_content_is_not_written_into(
     assert run(*(paths.get(word, word) for word in command), "--quiet") == 2
     assert "photos: not empty, and not made by this command; give another folder" in capsys.readouterr().err
     assert [file.name for file in (tmp_path / "photos").iterdir()] == ["report.html"]
+
+
+def test_a_run_is_not_lost_if_the_new_one_maps_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, data = make_run(tmp_path / "run").folder, tmp_path / "data"
+    before = {file.name: file.read_bytes() for file in out.iterdir()}
+    data.mkdir()
+    for number in range(3):
+        np.zeros((9, 4), np.float32).tofile(data / f"{number}.bin")
+    assert run("map", data, "--out", out, "--overwrite", "--quiet") == 2
+    assert "none of 3 scans could be used" in capsys.readouterr().err
+    assert {file.name: file.read_bytes() for file in out.iterdir()} == before
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["data", "run"]
+    monkeypatch.chdir(out)
+    assert run("map", data, "--out", ".", "--overwrite", "--quiet") == 2
+    assert "holds the present folder" in capsys.readouterr().err
+    assert {file.name: file.read_bytes() for file in out.iterdir()} == before

@@ -30,13 +30,12 @@ WRITING = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
-from segslam.output.map.write import TemporaryDirectory
-from segslam.core.interrupts import ctrl_c_in_order, removed_when_stopped
-from segslam.core.whole_files import whole_file
+from segslam.core.interrupts import ctrl_c_in_order
+from segslam.core.whole_files import temporary_folder, whole_file
 with ctrl_c_in_order(), whole_file(Path(sys.argv[1], "half.txt")) as part:
     part.write_text("half")
-    with TemporaryDirectory(dir=sys.argv[1]) as scratch, removed_when_stopped(Path(scratch)):
-        Path(scratch, "half").touch()
+    with temporary_folder(Path(sys.argv[1]), ".map-") as scratch:
+        (scratch / "half").touch()
         import interrupted_while_it_loads
 """
 IMPATIENT = """

@@ -75,11 +75,16 @@ _ASIDE: dict[Path, Path] = {}
 
 
 def set_aside(folder: Path) -> None:
-    """Rename a folder, so that a new one can take its place; `settle` decides between the two."""
+    """Rename a folder, so that a new one can take its place; `settle` decides between the two.
+
+    If a command was killed before that, what it had set aside is kept instead: it is what was whole.
+    """
     whole = folder.resolve()
     aside = whole.with_name(f".{whole.name}.replaced")
-    shutil.rmtree(aside, ignore_errors=True)  # of a command that was killed
-    whole.rename(aside)
+    if aside.exists():
+        shutil.rmtree(whole)
+    else:
+        whole.rename(aside)
     _ASIDE[whole] = aside
 
 

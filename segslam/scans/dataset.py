@@ -151,9 +151,9 @@ def no_topics(topic: str) -> SegslamError:
 
 def times_of(cloud: Cloud, stamp_ns: int) -> Vector:
     """`sweep_times` of the valid points of a cloud; the times of the others, which may be anything, are 0."""
-    kept = _is_return(cloud.points)
-    if len(cloud.times) != len(kept):
+    if len(cloud.times) != len(cloud.points):
         return NO_TIMES
+    kept = _is_return(cloud.points)
     found = sweep_times(cloud.times[kept], int(kept.sum()), stamp_ns * 1e-9)
     if len(found) == 0:
         return NO_TIMES

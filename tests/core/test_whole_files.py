@@ -12,7 +12,7 @@ from helpers.made_logs import largest_file
 
 from segslam.core.geometry import transform, yaw
 from segslam.core.types import SegslamError, WorkFailed
-from segslam.core.whole_files import temporary_folder, whole_file, write_whole
+from segslam.core.whole_files import set_aside, settle, temporary_folder, whole_file, write_whole
 from segslam.graph.edges import Edge
 from segslam.graph.g2o import G2oGraph, write_g2o
 
@@ -28,6 +28,19 @@ def test_a_signal_while_a_temporary_folder_is_made_leaves_none(tmp_path: Path, m
     with pytest.raises(KeyboardInterrupt), temporary_folder(tmp_path, ".map-"):
         pass
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_killed_command_set_aside_is_put_back(tmp_path: Path) -> None:
+    folder, aside = tmp_path / "run", tmp_path / ".run.replaced"
+    aside.mkdir()
+    (aside / "log.mcap").write_text("whole")
+    folder.mkdir()
+    (folder / "log.mcap").write_text("without a step")
+    set_aside(folder)
+    folder.mkdir()
+    settle()
+    assert [file.name for file in tmp_path.iterdir()] == ["run"]
+    assert (folder / "log.mcap").read_text() == "whole"
 
 
 @pytest.fixture

@@ -15,6 +15,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -48,6 +49,18 @@ MOST_UNCHECKED = 9
 """Chosen: number of scans after which a sensor that seems to stand still is checked."""
 
 
+class Proposed(NamedTuple):
+    """A scan, and its expected pose before it is compared with the last ones."""
+
+    scan: SeenScan
+    T_odom_lidar: Transform
+    """By the odometry."""
+    T_odom_predicted: Transform
+    """By the last motions."""
+    gap: float
+    """Time since the previous scan, in intervals of the sensor."""
+
+
 class CheckedOdometry:
     """Another odometry with its motions checked and replaced by more likely ones."""
 
@@ -58,7 +71,7 @@ class CheckedOdometry:
         self._refine = config.refine
         self._shared = geometry.tangent(rotation_rad=math.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M)
         self._map = LocalMap(config.refine)
-        self._search = PoseSearch(recover, voxel_m=config.refine.voxel_m)
+        self._recover = recover
         self._lost: tuple[LocalMap, Transform, int] | None = None
         """The map before a break, in which the next scans are tried, the motion per interval there, and the number of
         scans since then."""
@@ -84,10 +97,12 @@ class CheckedOdometry:
             self._inner.foresee(ahead, gap=self._intervals.gap(ahead.stamp_ns))
         if not self._config.health.check:
             return proposed
-        seen = SeenScan(proposed.points, self._refine)
-        T_odom_proposed = self._T_odom_inner @ proposed.T_odom_lidar
         is_watched = self._is_watched
-        T_odom_lidar, motion = self._checked(T_odom_proposed, seen, gap)
+        T_odom_predicted = self._T_odom_last @ self._motion.predicted(gap)
+        seen = SeenScan(proposed.points, self._refine)
+        T_odom_lidar, motion = self._checked(
+            Proposed(seen, self._T_odom_inner @ proposed.T_odom_lidar, T_odom_predicted, gap)
+        )
         self._T_odom_last = T_odom_lidar
         if is_watched and motion.state is MotionState.REFINED:
             self._T_odom_inner = geometry.nearest_transform(T_odom_lidar @ geometry.inverse(proposed.T_odom_lidar))
@@ -99,92 +114,90 @@ class CheckedOdometry:
         agrees = len(self._offs) == WINDOW and sum(self._offs) < MOST_OFF_TOGETHER
         return self._inner.is_from_scans and not agrees
 
-    def _checked(self, T_odom_proposed: Transform, scan: SeenScan, gap: float) -> tuple[Transform, Motion]:
+    def _checked(self, proposed: Proposed) -> tuple[Transform, Motion]:
         """The pose of a scan and the result of its check, if one is due."""
-        T_odom_predicted = self._T_odom_last @ self._motion.predicted(gap)
-        if not self._is_due(T_odom_proposed, T_odom_predicted, scan, gap):
+        if not self._is_due(proposed):
             self._num_unchecked += 1
-            self._motion.follow(geometry.inverse(self._T_odom_last) @ T_odom_proposed, gap)
-            return T_odom_proposed, Motion(MotionState.UNCHECKED)
+            self._motion.follow(self._since_last(proposed.T_odom_lidar), proposed.gap)
+            return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
         self._num_unchecked = 0
-        if len(scan.thinned) < MIN_POINTS:
-            return self._of_few_points(T_odom_proposed, gap)
+        if len(proposed.scan.thinned) < MIN_POINTS:
+            return self._of_few_points(proposed)
         if len(self._map) == 0:
-            self._map.add(T_odom_proposed, scan)
-            return T_odom_proposed, Motion(MotionState.UNCHECKED)
-        if not self._is_watched and gap == 1.0:
-            confirmed = self._confirmed(T_odom_proposed, scan, gap)
+            self._map.add(proposed.T_odom_lidar, proposed.scan)
+            return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
+        if not self._is_watched and proposed.gap == 1.0:
+            confirmed = self._confirmed(proposed)
             if confirmed is not None:
                 return confirmed
-        return self._registered(T_odom_proposed, T_odom_predicted, scan, gap)
+        return self._registered(proposed)
 
-    def _is_due(self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan, gap: float) -> bool:
+    def _is_due(self, proposed: Proposed) -> bool:
         """True if the motion is as long as a keyframe's since the last checked scan, or unlike the last motion."""
-        if len(self._map) == 0 or self._is_watched or gap > 1.0 or self._num_unchecked >= MOST_UNCHECKED:
+        if len(self._map) == 0 or self._is_watched or proposed.gap > 1.0 or self._num_unchecked >= MOST_UNCHECKED:
             return True
-        moved_m = geometry.displacement_m(scan.few, T_odom_proposed, self._map.T_odom_map)
-        sudden_m = geometry.displacement_m(scan.few, T_odom_proposed, T_odom_predicted)
+        few = proposed.scan.few
+        moved_m = geometry.displacement_m(few, proposed.T_odom_lidar, self._map.T_odom_map)
+        sudden_m = geometry.displacement_m(few, proposed.T_odom_lidar, proposed.T_odom_predicted)
         return moved_m >= self._config.keyframes.distance_m or sudden_m >= self._refine.voxel_m
 
-    def _confirmed(self, T_odom_proposed: Transform, scan: SeenScan, gap: float) -> tuple[Transform, Motion] | None:
+    def _confirmed(self, proposed: Proposed) -> tuple[Transform, Motion] | None:
         """The proposed pose, if a few steps to the last checked scan leave it and fit as usual; else None."""
-        T_odom_map = self._map.T_odom_map
-        T_map_proposed = geometry.inverse(T_odom_map) @ T_odom_proposed
-        found = self._map.check(scan, T_map_proposed)
+        T_map_proposed = self._map.pose_of(proposed.T_odom_lidar)
+        found = self._map.check(proposed.scan, T_map_proposed)
         if found is None:
             return None
         off = _off(found.T_map_lidar, self._covariance(found), T_map_proposed)
         is_usual = self._usual_check.includes(found.mean_log, least_spread=found.num_patches**-0.5)
-        if off > MOST_OFF or not is_usual:
-            if off <= MOST_OFF:
-                self._usual_check.note(found.mean_log)
+        if off > MOST_OFF:
             return None
         self._usual_check.note(found.mean_log)
+        if not is_usual:
+            return None
         if not self._inner.is_from_scans:
-            return self._kept(T_odom_proposed, T_map_proposed, found, scan, gap, is_unsure=False)
-        T_last_lidar = geometry.inverse(self._T_odom_last) @ T_odom_proposed
-        if _off(*self._motion.fused(T_last_lidar, self._covariance(found), gap), T_last_lidar) > MOST_OFF:
+            return self._kept(proposed, found, is_unsure=False)
+        T_last_lidar = self._since_last(proposed.T_odom_lidar)
+        if _off(*self._motion.fused(T_last_lidar, self._covariance(found), proposed.gap), T_last_lidar) > MOST_OFF:
             return None  # the last motions say more than the scan does
         self._offs.append(off)
-        _, covariance = self._motion.update(T_last_lidar, self._covariance(found), gap)
-        self._map.add(T_odom_proposed, scan)
-        return T_odom_proposed, self._result(MotionState.CONFIRMED, T_map_proposed, found, covariance)
+        _, covariance = self._motion.update(T_last_lidar, self._covariance(found), proposed.gap)
+        self._map.add(proposed.T_odom_lidar, proposed.scan)
+        return proposed.T_odom_lidar, self._result(MotionState.CONFIRMED, T_map_proposed, found, covariance)
 
-    def _registered(
-        self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan, gap: float
-    ) -> tuple[Transform, Motion]:
+    def _registered(self, proposed: Proposed) -> tuple[Transform, Motion]:
         """The most likely pose of the scan in the local map."""
-        fits, is_rejoined = self._poses(T_odom_proposed, T_odom_predicted, scan, gap)
-        T_odom_map = self._map.T_odom_map
-        T_map_proposed = geometry.inverse(T_odom_map) @ T_odom_proposed
+        scan, gap, before = proposed.scan, proposed.gap, self._map
+        search, fits = self._poses(proposed)
+        is_rejoined = self._map is not before
+        T_odom_map, T_map_proposed = self._map.T_odom_map, self._map.pose_of(proposed.T_odom_lidar)
         by_chance = 0.0
         elsewhere = float(is_rejoined)  # the scan before is not in the map before a break
         if not is_rejoined and not self._is_usual(fits):
-            by_chance = self._by_chance(scan, fits, gap)
-            elsewhere = max(self._search.elsewhere(scan, self._fused(fits, gap)), by_chance)
+            by_chance = self._by_chance(search, fits, gap)
+            elsewhere = max(search.elsewhere(self._fused(fits, gap)), by_chance)
             if elsewhere * ELSEWHERE_M**2 > BREAK_M**2 or not self._motion.is_known:
-                recognised = self._search.without_guess(self._map, scan)
-                if recognised and (not fits or self._log_ratio(scan, recognised[0], fits[0]) >= 0.0):
+                recognised = search.without_guess(self._recover)
+                if recognised and (not fits or search.log_ratio(recognised[0], fits[0]) >= 0.0):
                     fits, elsewhere, by_chance = recognised, 0.0, 0.0
         best = fits[0] if fits else self._map.fit(scan, T_map_proposed)
         self._usual_fit.note(best.mean_log)
-        unsure = self._search.spread(scan, self._fused(fits, gap)) + elsewhere * np.diag(ANYWHERE**2)
+        unsure = search.spread(self._fused(fits, gap)) + elsewhere * np.diag(ANYWHERE**2)
         is_unsure = bool(unsure[3:, 3:].max() > BREAK_M**2)
-        if not self._inner.is_from_scans and (is_unsure or not self._contradicts(fits, T_map_proposed, scan)):
-            return self._kept(T_odom_proposed, T_map_proposed, best, scan, gap, is_unsure=is_unsure)
+        if not self._inner.is_from_scans and (is_unsure or not self._contradicts(search, fits, proposed)):
+            return self._kept(proposed, best, is_unsure=is_unsure)
         is_lost = elsewhere > 0.5 and not is_rejoined
         T_step_before = self._motion.T_step
-        T_last_lidar = geometry.nearest_transform(geometry.inverse(self._T_odom_last) @ T_odom_map @ best.T_map_lidar)
+        T_last_lidar = geometry.nearest_transform(self._since_last(T_odom_map) @ best.T_map_lidar)
         covariance = own = self._covariance(best)
         if by_chance < 0.5:  # a pose by chance does not show the speed
             own = self._motion.fused(T_last_lidar, covariance, gap)[1]
             T_last_lidar, covariance = self._motion.update(T_last_lidar, covariance, gap)
         T_odom_lidar, covariance = geometry.nearest_transform(self._T_odom_last @ T_last_lidar), covariance + unsure
-        off = _off(T_odom_lidar, own + unsure, T_odom_proposed)
-        is_unlikely = off > MOST_OFF and self._is_significant(scan, best, self._map.fit(scan, T_map_proposed))
+        off = _off(T_odom_lidar, own + unsure, proposed.T_odom_lidar)
+        is_unlikely = off > MOST_OFF and _is_significant(search, best, self._map.fit(scan, T_map_proposed))
         state = self._state(off, covariance, is_unlikely=is_unlikely)
         if state is MotionState.CONFIRMED:
-            T_odom_lidar = T_odom_proposed
+            T_odom_lidar = proposed.T_odom_lidar
         if is_lost:
             self._lost = self._lost or (self._map, T_step_before, 0)
             self._map = LocalMap(self._refine)
@@ -193,18 +206,19 @@ class CheckedOdometry:
         self._follow(state, T_odom_lidar)
         return T_odom_lidar, self._result(state, T_map_proposed, best, covariance)
 
-    def _of_few_points(self, T_odom_proposed: Transform, gap: float) -> tuple[Transform, Motion]:
+    def _of_few_points(self, proposed: Proposed) -> tuple[Transform, Motion]:
         """The pose of a scan with too few points to show its motion: that of other sensors, or the predicted one.
 
         KISS-ICP aligns even a few points, at any pose.
         """
+        T_odom_lidar, gap = proposed.T_odom_lidar, proposed.gap
         if not self._inner.is_from_scans or not self._motion.predicts:
-            return T_odom_proposed, Motion(MotionState.UNCHECKED)
+            return T_odom_lidar, Motion(MotionState.UNCHECKED)
         T_last_lidar, covariance = self._motion.update(self._motion.predicted(gap), np.diag(ANYWHERE**2), gap)
-        T_odom_lidar = geometry.nearest_transform(self._T_odom_last @ T_last_lidar)
-        state = self._state(_off(T_odom_lidar, covariance, T_odom_proposed), covariance, is_unlikely=True)
-        if state is MotionState.CONFIRMED:
-            T_odom_lidar = T_odom_proposed
+        T_odom_continued = geometry.nearest_transform(self._T_odom_last @ T_last_lidar)
+        state = self._state(_off(T_odom_continued, covariance, T_odom_lidar), covariance, is_unlikely=True)
+        if state is not MotionState.CONFIRMED:
+            T_odom_lidar = T_odom_continued
         self._follow(state, T_odom_lidar)
         return T_odom_lidar, Motion(state, information=self._own_information(covariance), covariance=covariance)
 
@@ -214,109 +228,92 @@ class CheckedOdometry:
             self._inner.follow(self._map.scans, T_odom_lidar, self._motion.T_step)
             self._T_odom_inner = np.eye(4)
 
-    def _poses(
-        self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan, gap: float
-    ) -> tuple[list[Fit], bool]:
-        """Poses in the local map, the most likely first, and whether this is the map before a break again."""
-        T_map_odom = geometry.inverse(self._map.T_odom_map)
-        T_last_map = geometry.inverse(self._T_odom_last) @ self._map.T_odom_map
+    def _poses(self, proposed: Proposed) -> tuple[PoseSearch, list[Fit]]:
+        """Poses in the local map, which may be that before a break again, the most likely first; and their search."""
+        T_last_map = self._since_last(self._map.T_odom_map)
 
         def prior(fit: Fit) -> float:
-            return self._motion.log_prior(T_last_map @ fit.T_map_lidar, self._covariance(fit), gap)
+            return self._motion.log_prior(T_last_map @ fit.T_map_lidar, self._covariance(fit), proposed.gap)
 
-        proposals = [T_map_odom @ T_odom_proposed, T_map_odom @ T_odom_predicted]
-        fits = self._search.near(self._map, scan, proposals, prior=prior)
-        rejoined = self._rejoined(T_odom_proposed, T_odom_predicted, scan, fits)
-        if rejoined:
-            return rejoined, True
-        T_map_last = T_map_odom @ self._T_odom_last
-        if not self._is_found(fits, proposals, scan):
-            proposals.append(T_map_last)
-            fits = self._search.near(self._map, scan, [T_map_last], fits, prior=prior)
-        if not self._is_found(fits, proposals, scan):
-            T_step = geometry.inverse(self._T_odom_last) @ T_odom_predicted
-            fits = self._search.around(self._map, scan, T_map_last, T_step, fits, prior=prior)
-        return fits, False
+        search = PoseSearch(self._map, proposed.scan, prior=prior)
+        starts = [self._map.pose_of(T) for T in (proposed.T_odom_lidar, proposed.T_odom_predicted)]
+        fits = search.near(starts)
+        rejoined = self._rejoined(proposed, fits)
+        if rejoined is not None:
+            return rejoined
+        T_map_last = self._map.pose_of(self._T_odom_last)
+        if not self._is_found(search, fits, starts):
+            starts.append(T_map_last)
+            fits = search.near([T_map_last], fits)
+        if not self._is_found(search, fits, starts):
+            fits = search.around(T_map_last, self._since_last(proposed.T_odom_predicted), fits)
+        return search, fits
+
+    def _since_last(self, T_odom_lidar: Transform) -> Transform:
+        """The motion since the last scan."""
+        return geometry.inverse(self._T_odom_last) @ T_odom_lidar
 
     def _fused(self, fits: Sequence[Fit], gap: float) -> list[Fit]:
         """The poses fused with the last motions: those along a wall are one where the scan shows no motion along it."""
-        T_last_map = geometry.inverse(self._T_odom_last) @ self._map.T_odom_map
+        T_last_map = self._since_last(self._map.T_odom_map)
         fused = []
         for fit in fits:
             T_last_lidar, _ = self._motion.fused(T_last_map @ fit.T_map_lidar, self._covariance(fit), gap)
             fused.append(replace(fit, T_map_lidar=geometry.inverse(T_last_map) @ T_last_lidar))
         return fused
 
-    def _by_chance(self, scan: SeenScan, fits: Sequence[Fit], gap: float) -> float:
+    def _by_chance(self, search: PoseSearch, fits: Sequence[Fit], gap: float) -> float:
         """Probability that the scan is far from all poses that were tried, so that the best one fits by chance.
 
         After a gap the sensor may be anywhere: the prior is that of the motion, the evidence the score of loops.
         """
-        untried = self._motion.may_exceed(self._search.far_m, gap)
+        untried = self._motion.may_exceed(search.far_m, gap)
         if not fits or untried < SIGNIFICANT:
             return untried
-        return untried / (1.0 + math.exp(self._search.log_odds(self._map, scan, fits[0])))
+        return untried / (1.0 + math.exp(search.log_odds(fits[0])))
 
-    def _contradicts(self, fits: Sequence[Fit], T_map_proposed: Transform, scan: SeenScan) -> bool:
+    def _contradicts(self, search: PoseSearch, fits: Sequence[Fit], proposed: Proposed) -> bool:
         """True if the most probable pose is significantly more probable than the proposed one, or any near it."""
-        near = [fit for fit in fits if self._search.is_same(scan, fit.T_map_lidar, T_map_proposed)]
-        proposed = [*near, self._map.fit(scan, T_map_proposed)]
-        return all(self._is_significant(scan, fits[0], fit) for fit in proposed)
+        T_map_proposed = self._map.pose_of(proposed.T_odom_lidar)
+        near = [fit for fit in fits if search.is_same(fit.T_map_lidar, T_map_proposed)]
+        others = [*near, self._map.fit(proposed.scan, T_map_proposed)]
+        return all(_is_significant(search, fits[0], fit) for fit in others)
 
-    def _is_significant(self, scan: SeenScan, fit: Fit, other: Fit) -> bool:
-        """True if the scan makes a pose significantly more probable than another, whatever the last motions were."""
-        return self._log_ratio(scan, fit, other) > -math.log(SIGNIFICANT)
-
-    def _log_ratio(self, scan: SeenScan, fit: Fit, other: Fit) -> float:
-        one, another = (self._search.log_odds(self._map, scan, each) + each.log_likelihood for each in (fit, other))
-        return one - another
-
-    def _kept(
-        self,
-        T_odom_proposed: Transform,
-        T_map_proposed: Transform,
-        best: Fit,
-        scan: SeenScan,
-        gap: float,
-        *,
-        is_unsure: bool,
-    ) -> tuple[Transform, Motion]:
+    def _kept(self, proposed: Proposed, best: Fit, *, is_unsure: bool) -> tuple[Transform, Motion]:
         """The pose of an odometry of other sensors, which the scans do not contradict."""
-        self._map.add(T_odom_proposed, scan)
-        self._motion.restart(geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_proposed, 1.0 / gap))
+        T_map_proposed = self._map.pose_of(proposed.T_odom_lidar)
+        self._map.add(proposed.T_odom_lidar, proposed.scan)
+        self._motion.restart(geometry.scaled(self._since_last(proposed.T_odom_lidar), 1.0 / proposed.gap))
         state = MotionState.UNCHECKED if is_unsure else MotionState.CONFIRMED
-        return T_odom_proposed, self._result(state, T_map_proposed, best, None)
+        return proposed.T_odom_lidar, self._result(state, T_map_proposed, best, None)
 
-    def _rejoined(
-        self, T_odom_proposed: Transform, T_odom_predicted: Transform, scan: SeenScan, here: Sequence[Fit]
-    ) -> list[Fit]:
+    def _rejoined(self, proposed: Proposed, here: Sequence[Fit]) -> tuple[PoseSearch, list[Fit]] | None:
         """Poses in the map before a break, if it explains the scan as usual and at least as well as `here`.
 
         It is then the local map again. `here`: the poses in the present local map. The break may have been a scan that
         nothing explains; the motion before it then continued.
         """
         if self._lost is None:
-            return []
+            return None
         local, T_step, num_scans = self._lost
-        T_map_odom = geometry.inverse(local.T_odom_map)
+        search = PoseSearch(local, proposed.scan)
         T_continued = geometry.scaled(T_step, num_scans + 2.0)
-        starts = [T_map_odom @ T_odom_proposed, T_map_odom @ T_odom_predicted, np.eye(4), T_continued]
-        near = self._search.near(local, scan, starts)
-        fits = self._search.around(local, scan, np.eye(4), T_step, near)
-        is_found = self._is_usual(fits) and (not here or fits[0].mean_log >= here[0].mean_log)
-        if is_found:
-            self._map = local
-        self._lost = None if is_found or num_scans + 1 >= WINDOW else (local, T_step, num_scans + 1)
-        return fits if is_found else []
+        by_odometry = [local.pose_of(T) for T in (proposed.T_odom_lidar, proposed.T_odom_predicted)]
+        fits = search.around(np.eye(4), T_step, search.near([*by_odometry, np.eye(4), T_continued]))
+        if self._is_usual(fits) and (not here or fits[0].mean_log >= here[0].mean_log):
+            self._map, self._lost = local, None
+            return search, fits
+        self._lost = None if num_scans + 1 >= WINDOW else (local, T_step, num_scans + 1)
+        return None
 
-    def _is_found(self, fits: Sequence[Fit], T_map_starts: Sequence[Transform], scan: SeenScan) -> bool:
+    def _is_found(self, search: PoseSearch, fits: Sequence[Fit], T_map_starts: Sequence[Transform]) -> bool:
         """True if the most likely pose is near one of the starts, and explains the scan as usual or has a good score.
 
         A registration that leads away from where it started may have ended at the first of several local optima.
         """
-        if not fits or not any(self._search.is_same(scan, fits[0].T_map_lidar, T_start) for T_start in T_map_starts):
+        if not fits or not any(search.is_same(fits[0].T_map_lidar, T_start) for T_start in T_map_starts):
             return False
-        return self._is_usual(fits) or self._search.log_odds(self._map, scan, fits[0]) > -math.log(SIGNIFICANT)
+        return self._is_usual(fits) or search.log_odds(fits[0]) > -math.log(SIGNIFICANT)
 
     def _is_usual(self, fits: Sequence[Fit]) -> bool:
         """True if the most likely pose explains the scan as usual; False if there is none."""
@@ -370,6 +367,11 @@ class CheckedOdometry:
             return None
         half = np.linalg.inv(whiten) @ directions
         return np.linalg.inv(model + (half * np.maximum(excess, 0.0)) @ half.T)
+
+
+def _is_significant(search: PoseSearch, fit: Fit, other: Fit) -> bool:
+    """True if the scan makes a pose significantly more probable than another, whatever the last motions were."""
+    return search.log_ratio(fit, other) > -math.log(SIGNIFICANT)
 
 
 def _off(T_known: Transform, covariance: Information, T_other: Transform) -> float:

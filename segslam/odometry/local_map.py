@@ -8,6 +8,7 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
+from segslam.core.points import voxel_means
 from segslam.core.types import Points, Registration, Transform
 from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.nudge import CHECK_VOXELS, NUM_POINTS, NUM_SEARCH, POLISH_VOXELS, SEARCH_VOXELS, nudge
@@ -68,7 +69,7 @@ class LocalMap:
     """The last scans that moved, in the frame of the newest one."""
 
     def __init__(self, config: RefineConfig) -> None:
-        self._voxel_m = config.voxel_m
+        self.voxel_m = config.voxel_m
         reaches_m = tuple(reach * config.voxel_m for reach in SEARCH_VOXELS_GICP)
         self._config = config.model_copy(update={"correspondence_m": reaches_m})
         self._scans: deque[tuple[Transform, Points]] = deque(maxlen=MAP_SCANS)
@@ -93,11 +94,15 @@ class LocalMap:
     def __len__(self) -> int:
         return len(self._scans)
 
+    def pose_of(self, T_odom_lidar: Transform) -> Transform:
+        """A pose of the odometry in the map's frame."""
+        return geometry.inverse(self.T_odom_map) @ T_odom_lidar
+
     def add(self, T_odom_lidar: Transform, scan: SeenScan) -> None:
         """Add a scan, unless it is too near to the newest one."""
         if self._scans:
             moved_m = geometry.displacement_m(scan.few, T_odom_lidar, self.T_odom_map)
-            if moved_m < SPACING_VOXELS * self._voxel_m:
+            if moved_m < SPACING_VOXELS * self.voxel_m:
                 return
         self._scans.append((T_odom_lidar, scan.thinned))
         self._whole.append((T_odom_lidar, scan))
@@ -121,13 +126,13 @@ class LocalMap:
         """
         if T_odom_lidar is self.T_odom_map:
             return points
-        return geometry.apply(geometry.inverse(self.T_odom_map) @ T_odom_lidar, points.astype(np.float64))
+        return geometry.apply(self.pose_of(T_odom_lidar), points.astype(np.float64))
 
     def surface(self) -> refinement.Surface:
         """The surface of all scans, in the frame of the newest one; cached."""
         if self._surface is None:
             clouds = [self._in_map(thinned, T_odom_lidar) for T_odom_lidar, thinned in self._scans]
-            merged = clouds[0] if len(clouds) == 1 else refinement.merge_clouds(clouds, config=self._config)
+            merged = clouds[0] if len(clouds) == 1 else voxel_means(np.vstack(clouds), self.voxel_m).astype(np.float32)
             self._surface = refinement.make_surface(merged, config=self._config)
         return self._surface
 
@@ -138,8 +143,8 @@ class LocalMap:
 
     def check(self, scan: SeenScan, T_map_lidar: Transform) -> Fit | None:
         """The pose after a few steps from this one to the newest scan alone; None if the two scans do not overlap."""
-        found = nudge(scan.thinned, self.newest.light, T_map_lidar, voxel_m=self._voxel_m, reaches=CHECK_VOXELS)
-        return None if found is None else fit(scan.thinned, self.newest.light, found, voxel_m=self._voxel_m)
+        found = nudge(scan.thinned, self.newest.light, T_map_lidar, voxel_m=self.voxel_m, reaches=CHECK_VOXELS)
+        return None if found is None else fit(scan.thinned, self.newest.light, found, voxel_m=self.voxel_m)
 
     def register(self, scan: SeenScan, T_map_guess: Transform) -> list[Fit]:
         """The pose of a scan in the map near an initial guess, by GICP and then robust steps; none without overlap."""
@@ -157,10 +162,10 @@ class LocalMap:
     def fit(self, scan: SeenScan, T_map_lidar: Transform) -> Fit:
         """The likelihood of the scan at this pose."""
         surface = self.surface()
-        return fit(scan.surface.points, surface, T_map_lidar, voxel_m=self._voxel_m, sigma_m=surface.roughness_m)
+        return fit(scan.surface.points, surface, T_map_lidar, voxel_m=self.voxel_m, sigma_m=surface.roughness_m)
 
     def _nudged(
         self, scan: SeenScan, T_map_guess: Transform, reaches: Sequence[float], num_points: int
     ) -> Transform | None:
         source, target = scan.surface.points, self.surface()
-        return nudge(source, target, T_map_guess, voxel_m=self._voxel_m, reaches=reaches, num_points=num_points)
+        return nudge(source, target, T_map_guess, voxel_m=self.voxel_m, reaches=reaches, num_points=num_points)

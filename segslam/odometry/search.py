@@ -5,7 +5,7 @@ along a wall. So different poses are compared by the score of loops, to which po
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -38,102 +38,97 @@ def unknown(fit: Fit) -> float:
 
 
 class PoseSearch:
-    """Registers scans with a local map from several proposals."""
+    """The search for the pose of one scan in a local map."""
 
-    def __init__(self, recover: Recover, *, voxel_m: float) -> None:
-        """`recover` receives the newest scans of a map, as many as have `DENSE_VOXELS`."""
-        self._recover = recover
-        self._same_m = SEARCH_VOXELS_GICP[-1] * voxel_m
-        self.far_m = SEARCH_VOXELS[0] * voxel_m
+    def __init__(self, local: LocalMap, scan: SeenScan, *, prior: Prior = unknown) -> None:
+        self._local, self._scan, self._prior = local, scan, prior
+        self._same_m = SEARCH_VOXELS_GICP[-1] * local.voxel_m
+        self.far_m = SEARCH_VOXELS[0] * local.voxel_m
         """Distance that a registration reaches."""
 
-    def is_same(self, scan: SeenScan, T_map_a: Transform, T_map_b: Transform) -> bool:
+    def is_same(self, T_map_a: Transform, T_map_b: Transform) -> bool:
         """True if a registration from one of two poses reaches the other."""
-        return geometry.displacement_m(scan.few, T_map_a, T_map_b) < self._same_m
+        return geometry.displacement_m(self._scan.few, T_map_a, T_map_b) < self._same_m
 
-    def near(
-        self,
-        local: LocalMap,
-        scan: SeenScan,
-        T_map_proposed: Sequence[Transform],
-        known: Sequence[Fit] = (),
-        *,
-        prior: Prior = unknown,
-    ) -> list[Fit]:
+    def near(self, T_map_proposed: Sequence[Transform], known: Sequence[Fit] = ()) -> list[Fit]:
         """`known` poses and those to which registrations from the proposals lead, the most probable first."""
         starts: list[Transform] = []
         for T_map_start in T_map_proposed:
-            if not any(self.is_same(scan, T_map_start, T_map_other) for T_map_other in starts):
+            if not any(self.is_same(T_map_start, T_map_other) for T_map_other in starts):
                 starts.append(T_map_start)
-        found = [fit for T_map_start in starts for fit in local.register(scan, T_map_start)]
-        return self._compared(local, scan, [*known, *(_with(prior, fit) for fit in found)])
+        return self._compared([*known, *self._registered(starts)])
 
-    def around(
-        self,
-        local: LocalMap,
-        scan: SeenScan,
-        T_map_last: Transform,
-        T_step: Transform,
-        known: Sequence[Fit],
-        *,
-        prior: Prior = unknown,
-    ) -> list[Fit]:
+    def around(self, T_map_last: Transform, T_step: Transform, known: Sequence[Fit]) -> list[Fit]:
         """`known` poses and those reached from poses around the last one: turned, and moved by shares of `T_step`."""
         starts = [
             T_map_last @ geometry.transform(geometry.exp(turn)[:3, :3], travel * T_step[:3, 3])
             for travel in TRAVELS
             for turn in TURNS
         ]
-        reached = [local.approach(scan, T_map_start) for T_map_start in starts]
-        found = [*known, *(_with(prior, fit) for fit in reached if fit is not None)]
-        found = self._compared(local, scan, found, num_ordered=NUM_REGISTERED + len(known))
+        reached = [self._local.approach(self._scan, T_map_start) for T_map_start in starts]
+        found = [*known, *(self._with_prior(fit) for fit in reached if fit is not None)]
+        found = self._compared(found, num_ordered=NUM_REGISTERED + len(known))
         T_map_known = [fit.T_map_lidar for fit in known]
         others = [fit.T_map_lidar for fit in found if not any(fit.T_map_lidar is other for other in T_map_known)]
-        registered = [fit for T_map_start in others[:NUM_REGISTERED] for fit in local.register(scan, T_map_start)]
-        return self._compared(local, scan, [*found, *(_with(prior, fit) for fit in registered)])
+        return self._compared([*found, *self._registered(others[:NUM_REGISTERED])])
 
-    def without_guess(self, local: LocalMap, scan: SeenScan) -> list[Fit]:
-        """Poses reached from the one that place recognition finds and verifies; none if it finds none."""
-        alignment = self._recover(scan.points, local.cloud(DENSE_VOXELS))
+    def without_guess(self, recover: Recover) -> list[Fit]:
+        """Poses reached from the one that place recognition finds and verifies; none if it finds none.
+
+        `recover` receives the newest scans of the map, as many as have `DENSE_VOXELS`.
+        """
+        alignment = recover(self._scan.points, self._local.cloud(DENSE_VOXELS))
         if isinstance(alignment, Rejected):
             return []
-        return local.register(scan, alignment.fine.T_target_source)
+        return self._local.register(self._scan, alignment.fine.T_target_source)
 
-    def elsewhere(self, scan: SeenScan, fits: Sequence[Fit]) -> float:
+    def elsewhere(self, fits: Sequence[Fit]) -> float:
         """Probability that a pose far from the most probable one is right instead; 1 without any pose."""
         if not fits:
             return 1.0
-        far = [fit for fit in fits[1:] if self._apart_m(scan, fits[0], fit) > self.far_m]
+        far = [fit for fit in fits[1:] if self._apart_m(fits[0], fit) > self.far_m]
         return max((as_likely(fit, fits[0]) for fit in far), default=0.0)
 
-    def log_odds(self, local: LocalMap, scan: SeenScan, fit: Fit) -> float:
+    def log_odds(self, fit: Fit) -> float:
         """Log odds that a pose is right, by the score of loops (nats)."""
         if fit.log_odds is not None:
             return fit.log_odds
-        return log_odds(scan.observed, local.observed, fit.T_map_lidar)
+        return log_odds(self._scan.observed, self._local.observed, fit.T_map_lidar)
 
-    def spread(self, scan: SeenScan, fits: Sequence[Fit]) -> Information:
+    def log_ratio(self, fit: Fit, other: Fit) -> float:
+        """How much more probable the scan makes a pose than another, whatever the last motions were (nats)."""
+        one, another = (self.log_odds(each) + each.log_likelihood for each in (fit, other))
+        return one - another
+
+    def spread(self, fits: Sequence[Fit]) -> Information:
         """Covariance (6, 6) of the choice between poses near the most probable one, tangent in the scan's frame."""
         covariance, total = np.zeros((6, 6)), 1.0
         for fit in fits[1:]:
-            if self._apart_m(scan, fits[0], fit) <= self.far_m:
+            if self._apart_m(fits[0], fit) <= self.far_m:
                 offset = geometry.log(geometry.inverse(fits[0].T_map_lidar) @ fit.T_map_lidar)
                 weight = as_likely(fit, fits[0])
                 covariance += weight * np.outer(offset, offset)
                 total += weight
         return covariance / total
 
-    def _apart_m(self, scan: SeenScan, one: Fit, other: Fit) -> float:
-        return geometry.displacement_m(scan.few, one.T_map_lidar, other.T_map_lidar)
+    def _registered(self, starts: Iterable[Transform]) -> list[Fit]:
+        fits = [fit for T_map_start in starts for fit in self._local.register(self._scan, T_map_start)]
+        return [self._with_prior(fit) for fit in fits]
 
-    def _compared(self, local: LocalMap, scan: SeenScan, fits: Sequence[Fit], *, num_ordered: int = 1) -> list[Fit]:
+    def _with_prior(self, fit: Fit) -> Fit:
+        return replace(fit, log_prior=self._prior(fit))
+
+    def _apart_m(self, one: Fit, other: Fit) -> float:
+        return geometry.displacement_m(self._scan.few, one.T_map_lidar, other.T_map_lidar)
+
+    def _compared(self, fits: Sequence[Fit], *, num_ordered: int = 1) -> list[Fit]:
         """The most probable pose first; of poses near each other only the one that explains the scan best.
 
         So many poses are in order; the others follow, of which those that cannot be among these are not scored.
         """
         kept: list[Fit] = []
         for fit in sorted(fits, key=lambda each: -_log_without_score(each)):
-            if not any(self.is_same(scan, fit.T_map_lidar, other.T_map_lidar) for other in kept):
+            if not any(self.is_same(fit.T_map_lidar, other.T_map_lidar) for other in kept):
                 kept.append(fit)
         if len(kept) < 2:
             return kept
@@ -142,7 +137,7 @@ class PoseSearch:
             last = judged[num_ordered - 1] if len(judged) >= num_ordered else None
             if last and _log_posterior(last) > _log_without_score(fit) + most_log_odds():
                 break  # no score brings this pose or a later one before it
-            judged.append(replace(fit, log_odds=self.log_odds(local, scan, fit)))
+            judged.append(replace(fit, log_odds=self.log_odds(fit)))
             judged.sort(key=lambda each: -_log_posterior(each))
         return [*judged, *kept[len(judged) :]]
 
@@ -163,7 +158,3 @@ def _log_posterior(fit: Fit) -> float:
 
 def _log_without_score(fit: Fit) -> float:
     return fit.log_likelihood + fit.log_prior
-
-
-def _with(prior: Prior, fit: Fit) -> Fit:
-    return replace(fit, log_prior=prior(fit))

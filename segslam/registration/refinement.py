@@ -5,7 +5,6 @@ translation] with the perturbation on the right.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -139,11 +138,6 @@ class LightSurface:
 def downsample(points: Points, *, config: RefineConfig) -> Points:
     """The mean point of each voxel within `max_range_m`, float32; about 100 KB per scan."""
     return voxel_means(points, config.voxel_m, beyond_m=0.0, within_m=MAX_RANGE_M).astype(np.float32)
-
-
-def merge_clouds(clouds: Sequence[Points], *, config: RefineConfig) -> Points:
-    """Downsampled clouds of the same frame merged: the mean point of each voxel, float32."""
-    return voxel_means(np.vstack(clouds), config.voxel_m).astype(np.float32)
 
 
 def make_surface(downsampled: Points, *, config: RefineConfig) -> Surface:

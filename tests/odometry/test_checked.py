@@ -15,7 +15,7 @@ from segslam.core.config import Config, load_config
 from segslam.core.evaluation import trajectory_metrics
 from segslam.core.types import Motion, MotionState, Registration, Rejected, RejectReason, Scan, Step, Trajectory
 from segslam.graph.noise import odometry_information
-from segslam.odometry.checked import CheckedOdometry
+from segslam.odometry.checked import CheckedOdometry, Proposed
 from segslam.odometry.kiss import KissOdometry
 from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.local_map import LocalMap, SeenScan
@@ -286,7 +286,7 @@ def test_the_local_map_is_given_up_where_a_scan_is_more_probably_elsewhere(
     odometry = CheckedOdometry(_LikeKiss(truth, CONFIG.odometry), CONFIG, recover=lambda source, target: none)
     _registered(odometry, scans[:SLIP_AT])
     monkeypatch.setattr(odometry, "_is_usual", lambda fits: False)
-    monkeypatch.setattr(odometry._search, "elsewhere", lambda scan, fits: probability)
+    monkeypatch.setattr(PoseSearch, "elsewhere", lambda search, fits: probability)
     motion = odometry.register(scans[SLIP_AT]).motion
     assert motion is not None
     assert motion.state is MotionState.BROKEN
@@ -378,9 +378,9 @@ def test_a_narrow_view_of_new_surroundings_does_not_slide_back_along_a_wall(data
         local.add(poses[index], seen(index))
     T_map_last, T_map_lidar = (geometry.inverse(local.T_odom_map) @ poses[index] for index in (row - 1, row))
     step = geometry.inverse(poses[row - 2]) @ poses[row - 1]
-    search = PoseSearch(lambda source, target: Rejected(RejectReason.HIGH_RESIDUAL), voxel_m=CONFIG.refine.voxel_m)
-    near = search.near(local, scan, [T_map_last @ step, T_map_last])
-    found = search.around(local, scan, T_map_last, step, near)
+    search = PoseSearch(local, scan)
+    near = search.near([T_map_last @ step, T_map_last])
+    found = search.around(T_map_last, step, near)
     assert geometry.distance(geometry.inverse(T_map_lidar) @ found[0].T_map_lidar) < 0.3
     assert max(found, key=lambda fit: fit.mean_log) is not found[0], "by the likelihood alone, another"
 
@@ -403,7 +403,7 @@ def test_poses_that_no_score_brings_among_the_first_are_not_scored(monkeypatch: 
     local = LocalMap(CONFIG.refine)
     local.add(truth.T_world_lidar[0], SeenScan(scans[0].points, CONFIG.refine))
     scan = SeenScan(scans[1].points, CONFIG.refine)
-    search = PoseSearch(lambda source, target: Rejected(RejectReason.HIGH_RESIDUAL), voxel_m=CONFIG.refine.voxel_m)
+    search = PoseSearch(local, scan)
     apart = [geometry.transform(geometry.yaw(turn), [0.0, 0.0, 0.0]) for turn in np.radians([0.0, 90.0, 180.0, 270.0])]
     fits = [local.fit(scan, T_map_lidar) for T_map_lidar in apart]
     likely = [replace(fit, mean_log=0.001 * number) for number, fit in enumerate(fits)]
@@ -420,7 +420,7 @@ def test_poses_that_no_score_brings_among_the_first_are_not_scored(monkeypatch: 
         return odds[id(T_map_lidar)]
 
     monkeypatch.setattr("segslam.odometry.search.log_odds", scored_by)
-    order = search._compared(local, scan, [*unlikely, *likely], num_ordered=3)
+    order = search._compared([*unlikely, *likely], num_ordered=3)
     assert [id(fit.T_map_lidar) for fit in order[:4]] == [id(likely[number].T_map_lidar) for number in (1, 2, 0, 3)]
     assert len(order) == 8
     assert len(scored) == 4
@@ -435,10 +435,11 @@ def test_a_scan_of_an_unusual_fit_is_searched_around_unless_its_score_is_good(
     _registered(odometry, scans[:SLIP_AT])
     searched: list[object] = []
     monkeypatch.setattr(odometry, "_is_usual", lambda fits: False)
-    monkeypatch.setattr(odometry._search, "log_odds", lambda *_: log_odds)
-    monkeypatch.setattr(odometry._search, "around", lambda local, scan, *_, **__: searched.append(scan) or [])
+    monkeypatch.setattr(PoseSearch, "log_odds", lambda *_: log_odds)
+    monkeypatch.setattr(PoseSearch, "around", lambda search, *_: searched.append(search) or [])
     T_odom_lidar = geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[SLIP_AT]
-    odometry._poses(T_odom_lidar, T_odom_lidar, SeenScan(scans[SLIP_AT].points, CONFIG.refine), 1.0)
+    seen = SeenScan(scans[SLIP_AT].points, CONFIG.refine)
+    odometry._poses(Proposed(seen, T_odom_lidar, T_odom_lidar, 1.0))
     assert bool(searched) is is_searched
 
 
@@ -458,9 +459,9 @@ def test_a_fit_below_the_last_ones_is_searched_around_however_much_the_checks_va
         odometry._usual_fit.note(found.mean_log + 1.0)
         odometry._usual_check.note(sign * spread)
     searched: list[object] = []
-    monkeypatch.setattr(odometry._search, "log_odds", lambda *_: 1.0)
-    monkeypatch.setattr(odometry._search, "around", lambda local, scan, *_, **__: searched.append(scan) or [])
-    odometry._poses(T_odom_lidar, T_odom_lidar, seen, 1.0)
+    monkeypatch.setattr(PoseSearch, "log_odds", lambda *_: 1.0)
+    monkeypatch.setattr(PoseSearch, "around", lambda search, *_: searched.append(search) or [])
+    odometry._poses(Proposed(seen, T_odom_lidar, T_odom_lidar, 1.0))
     assert len(searched) == 1
 
 
@@ -472,9 +473,8 @@ def test_a_scan_that_no_proposal_explains_is_tried_with_turns_about_each_axis(ax
         def approach(self, scan: SeenScan, T_map_guess: np.ndarray) -> None:
             starts.append(T_map_guess)
 
-    search = PoseSearch(lambda source, target: Rejected(RejectReason.HIGH_RESIDUAL), voxel_m=0.5)
     scan = SeenScan(np.zeros((1, 3), np.float32), CONFIG.refine)
-    assert search.around(Nothing(CONFIG.refine), scan, np.eye(4), np.eye(4), []) == []
+    assert PoseSearch(Nothing(CONFIG.refine), scan).around(np.eye(4), np.eye(4), []) == []
     turned = geometry.exp(np.radians(-30.0) * np.eye(6)[axis])
     assert any(np.allclose(start, turned) for start in starts)
 
@@ -501,11 +501,9 @@ def test_a_registration_that_leads_away_from_its_start_is_compared_with_others(m
 
     before, now = truth.T_world_lidar[SLIP_AT - 1 : SLIP_AT + 1]
 
-    def slides(
-        search: PoseSearch, local: LocalMap, scan: SeenScan, starts: object, known: object = (), **_: object
-    ) -> list[Fit]:
+    def slides(search: PoseSearch, starts: object, known: object = ()) -> list[Fit]:
         beside = geometry.inverse(before) @ now @ geometry.transform(np.eye(3), [0.0, 2.0, 0.0])
-        fit = local.fit(scan, beside)
+        fit = search._local.fit(search._scan, beside)
         return [replace(fit, mean_log=usual - 2.0 * fit.num_patches**-0.5)]
 
     monkeypatch.setattr(PoseSearch, "near", slides)
@@ -523,11 +521,10 @@ def test_a_motion_is_unsure_by_the_distance_of_two_poses_that_explain_the_scan_a
     usual = float(np.median(odometry._usual_fit._values))
     T_before_now = geometry.inverse(truth.T_world_lidar[SLIP_AT - 1]) @ truth.T_world_lidar[SLIP_AT]
 
-    def two(
-        search: PoseSearch, local: LocalMap, scan: SeenScan, starts: object, known: object = (), **_: object
-    ) -> list[Fit]:
+    def two(search: PoseSearch, starts: object, known: object = ()) -> list[Fit]:
         places = [T_before_now @ geometry.transform(np.eye(3), [0.0, left_m, 0.0]) for left_m in (0.0, 1.2)]
-        return [replace(local.fit(scan, T), mean_log=usual, information=1e4 * np.eye(6)) for T in places]
+        fits = [search._local.fit(search._scan, T) for T in places]
+        return [replace(fit, mean_log=usual, information=1e4 * np.eye(6)) for fit in fits]
 
     monkeypatch.setattr(PoseSearch, "near", two)
     motion = odometry.register(scans[SLIP_AT]).motion

@@ -14,7 +14,7 @@ from segslam.core.memory import note_peak_of
 from segslam.core.types import BadScan, Points, Scan, SegslamError, Transform
 from segslam.odometry.aligner import KissAligner, as_points, serve
 from segslam.odometry.kiss import KissOdometry, kiss_config
-from segslam.odometry.sweep import Swept, deskew_scan
+from segslam.odometry.sweep import PosedScans, Swept, deskew_scan
 
 MOST_SHARED = 2**18
 """Points of a sweep that the two processes exchange in shared memory, 6 MB; larger ones are sent through the pipe."""
@@ -46,9 +46,7 @@ class OdometryApart(KissOdometry):
             self._apart.begin_to_align(swept[0], geometry.scaled(self._T_last_lidar, gap))
             self._foreseen = swept
 
-    def follow(
-        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
-    ) -> None:
+    def follow(self, scans: PosedScans, T_odom_lidar: Transform, T_before_lidar: Transform) -> None:
         """As `KissOdometry.follow`."""
         if self._foreseen is not None:
             T_discarded, self._foreseen = self._apart.begun(), None
@@ -91,8 +89,7 @@ class _AlignerApart(KissAligner):
 
     def begin(self, config: KISSConfig) -> None:
         """Replace the aligner by a new one."""
-        with self._reported():
-            self._pipe.send(("begin", config))
+        self._send("begin", config)
 
     def align(self, points: Points, T_last_predicted: Transform) -> Transform:
         """As `KissAligner.align`."""
@@ -101,38 +98,38 @@ class _AlignerApart(KissAligner):
 
     def follow(self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform) -> None:
         """As `KissAligner.follow`."""
-        self._exchange("follow", list(scans), T_odom_lidar)
+        self.alone()
+        self._send("follow", list(scans), T_odom_lidar)
+        self._answer()
 
     def begin_to_align(self, points: Points, T_last_predicted: Transform) -> None:
         """As `align`, whose result `begun` returns; nothing but `alone` may be asked until then."""
-        with self._reported():
-            self._pipe.send(("align", _shared_or_sent(points, self._shared), T_last_predicted))
+        self._send("align", _shared_or_sent(points, self._shared), T_last_predicted)
 
     def begun(self) -> Transform:
         """The result of the alignment that was begun."""
         self.alone()
-        with self._reported():
-            return self._pipe.recv()
+        return self._answer()
 
     def align_alone(self, points: Points, T_last_predicted: Transform) -> None:
         """As `KissAligner.align_alone`; the other process works while this one continues."""
         self.alone()  # the shared memory is in use until then
-        with self._reported():
-            self._pipe.send(("align_alone", _shared_or_sent(points, self._shared_alone), T_last_predicted))
+        self._send("align_alone", _shared_or_sent(points, self._shared_alone), T_last_predicted)
         self._is_waiting = True
 
     def alone(self) -> list[Transform]:
         """As `KissAligner.alone`, also after `close`."""
         if self._is_waiting:
             self._is_waiting = False
-            with self._reported():
-                self._alone.append(self._pipe.recv())
+            self._alone.append(self._answer())
         return self._alone
 
-    def _exchange(self, *request: Any) -> Any:
-        self.alone()
+    def _send(self, *request: Any) -> None:
         with self._reported():
             self._pipe.send(request)
+
+    def _answer(self) -> Any:
+        with self._reported():
             return self._pipe.recv()
 
     @contextmanager

@@ -11,7 +11,7 @@ from segslam.core import geometry
 from segslam.core.config import OdometryConfig
 from segslam.core.types import BadScan, Points, Scan, Transform
 from segslam.odometry.aligner import KissAligner
-from segslam.odometry.sweep import OdometryResult, Swept, deskew_scan
+from segslam.odometry.sweep import OdometryResult, PosedScans, Swept, deskew_scan
 
 
 class KissOdometry:
@@ -49,9 +49,7 @@ class KissOdometry:
         swept = deskew_scan(scan, self._T_last_lidar, self._config)
         return swept, self._aligner.align(swept[0], geometry.scaled(self._T_last_lidar, gap))
 
-    def follow(
-        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
-    ) -> None:
+    def follow(self, scans: PosedScans, T_odom_lidar: Transform, T_before_lidar: Transform) -> None:
         """Continue from another pose of the last scan, with a local map of these scans alone."""
         self._has_followed = True
         self._aligner.follow(scans, T_odom_lidar)

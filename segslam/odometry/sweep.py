@@ -13,6 +13,8 @@ from segslam.core.points import is_finite, within_range
 from segslam.core.types import BadScan, Motion, Points, Scan, ScanLabels, Trajectory, Transform, Vector
 from segslam.labels.label_files import of_rows
 
+PosedScans = Sequence[tuple[Transform, Points]]
+"""Poses of scans in the odometry's frame, and their downsampled points."""
 STAMP_TOLERANCE_S = 0.01
 """Chosen: largest time difference between a scan and its pose in a given trajectory (s)."""
 
@@ -49,10 +51,8 @@ class Odometry(Protocol):
         """
         ...
 
-    def follow(
-        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
-    ) -> None:
-        """Continue from another pose of the last scan, with a local map of these scans (poses and downsampled points).
+    def follow(self, scans: PosedScans, T_odom_lidar: Transform, T_before_lidar: Transform) -> None:
+        """Continue from another pose of the last scan, with a local map of these scans.
 
         `T_before_lidar`: the motion between the last two scans, per interval of the sensor.
         """
@@ -132,9 +132,7 @@ class GivenOdometry:
         self._T_odom_given, self._T_odom_last, self._T_given_last = T_odom_given, T_odom_lidar, T_given_lidar
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
 
-    def follow(
-        self, scans: Sequence[tuple[Transform, Points]], T_odom_lidar: Transform, T_before_lidar: Transform
-    ) -> None:
+    def follow(self, scans: PosedScans, T_odom_lidar: Transform, T_before_lidar: Transform) -> None:
         """Continue from another pose of the last scan."""
         self._T_odom_given = T_odom_lidar @ geometry.inverse(self._T_given_last)
         self._T_odom_last = T_odom_lidar

@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 from scipy.fft import irfft, rfft
 
 from segslam.candidates.signature import NUM_ANGLES, NUM_RADII, PlaceSignature
+from segslam.core.trajectory import Rows
 from segslam.core.types import Indices, Vector
 
 NUM_HARMONICS = 12
@@ -32,44 +33,37 @@ class Places:
     """Signatures of places, 2.6 kB each: the spectra and their magnitudes, which are searched."""
 
     def __init__(self) -> None:
-        self._ids = np.empty(0, np.int64)
-        self._spectra: UInt8[np.ndarray, "n 24 60"] = np.empty((0, NUM_RADII, NUM_ANGLES), np.uint8)
-        self._invariants: Float[np.ndarray, "n 288"] = np.empty((0, NUM_RADII * NUM_HARMONICS), np.float32)
-        self._num = 0
+        self._ids = Rows(np.empty(0, np.int64))
+        self._spectra = Rows(np.empty((0, NUM_RADII, NUM_ANGLES), np.uint8))
+        self._invariants = Rows(np.empty((0, NUM_RADII * NUM_HARMONICS), np.float32))
 
     def __len__(self) -> int:
-        return self._num
+        return len(self._ids)
 
     @property
     def bytes_per_place(self) -> int:
         """Memory per place in bytes."""
-        return self._ids.itemsize + self._spectra[:1].nbytes + self._invariants[:1].nbytes
+        return sum(rows.all()[:1].nbytes for rows in (self._ids, self._spectra, self._invariants))
 
     def add(self, place_id: int, signature: PlaceSignature) -> None:
         """Add a place. Ids may come in any order, each once."""
-        if self._num == len(self._ids):
-            more = max(self._num, 64)
-            self._ids, self._spectra, self._invariants = (
-                np.concatenate([kept, np.zeros((more, *kept.shape[1:]), kept.dtype)])
-                for kept in (self._ids, self._spectra, self._invariants)
-            )
-        self._ids[self._num] = place_id
-        self._spectra[self._num] = signature.spectrum
-        self._invariants[self._num] = _invariant(signature)
-        self._num += 1
+        self._ids.append(place_id)
+        self._spectra.append(signature.spectrum)
+        self._invariants.append(_invariant(signature))
 
     def shortlist(
         self, signature: PlaceSignature, *, most: int = 20, below_id: int | None = None
     ) -> tuple[PlaceCandidate, ...]:
         """The places most similar to a scan, best first; only ids below `below_id`, if given."""
-        rows = np.arange(self._num) if below_id is None else np.flatnonzero(self._ids[: self._num] < below_id)
+        ids = self._ids.all()
+        rows = np.arange(len(ids)) if below_id is None else np.flatnonzero(ids < below_id)
         if not len(rows):
             return ()
-        similarity = np.einsum("ij,j->i", self._invariants[: self._num], _invariant(signature))  # uses one thread
+        similarity = np.einsum("ij,j->i", self._invariants.all(), _invariant(signature))  # uses one thread
         kept = rows[np.argsort(-similarity[rows], kind="stable")[: max(NUM_TURNED, most)]]
         scores, yaws = self._turned(signature, kept)
         best = np.argsort(-scores, kind="stable")[:most]
-        return tuple(PlaceCandidate(int(self._ids[kept[k]]), float(scores[k]), float(yaws[k])) for k in best)
+        return tuple(PlaceCandidate(int(ids[kept[k]]), float(scores[k]), float(yaws[k])) for k in best)
 
     def shortlist_around(
         self, signatures: Iterable[PlaceSignature], *, most: int = 20, below_id: int | None = None
@@ -83,7 +77,10 @@ class Places:
 
     def _turned(self, signature: PlaceSignature, rows: Indices) -> tuple[Vector, Vector]:
         """Largest correlation of the spectra of some places with the scan's, over all yaws, and the yaws."""
-        own, theirs = rfft(_centred(signature.spectrum[None]), axis=2), rfft(_centred(self._spectra[rows]), axis=2)
+        own, theirs = (
+            rfft(_centred(signature.spectrum[None]), axis=2),
+            rfft(_centred(self._spectra.all()[rows]), axis=2),
+        )
         correlation = irfft((theirs * np.conj(own)).sum(axis=1), NUM_ANGLES, axis=1)
         return correlation.max(axis=1), -correlation.argmax(axis=1) % NUM_ANGLES * math.pi / NUM_ANGLES
 

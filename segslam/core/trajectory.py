@@ -54,7 +54,7 @@ class Rows:
     def append(self, row: np.ndarray | float) -> None:
         """Add a row; amortised constant time."""
         if self._num == len(self._rows):
-            longer = np.empty((max(16, 2 * self._num), *self._rows.shape[1:]))
+            longer = np.empty((max(16, 2 * self._num), *self._rows.shape[1:]), self._rows.dtype)
             longer[: self._num] = self._rows
             self._rows = longer
         self._rows[self._num] = row

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -44,10 +44,6 @@ class Fixes:
     def usable(self) -> Mask:
         """(n,) True for fixes without a reason against them."""
         return np.array([not reason for reason in self.reasons], dtype=bool)
-
-    def shifted(self, seconds: float) -> "Fixes":
-        """The fixes with `seconds` added to their times."""
-        return replace(self, stamp_ns=self.stamp_ns + round(1e9 * seconds))
 
 
 @dataclass(frozen=True, slots=True)

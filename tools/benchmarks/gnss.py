@@ -56,7 +56,7 @@ def _alterations(residuals: list[Path] | None) -> dict[str, Alteration]:
         "30 % single ones wrong by 30 m": _wrong,
         "30 % wrong by 30 m, in runs of 60 s": partial(_wrong, run_s=60.0),
         "a jump of 50 m that stays for 5 minutes": _jump,
-        "clock 0.5 s off": lambda fixes: fixes.shifted(0.5),
+        "clock 0.5 s off": lambda fixes: replace(fixes, stamp_ns=fixes.stamp_ns + 500_000_000),
     }
     made |= {f"third {third + 1} removed": partial(_without_third, third=third) for third in range(3)}
     if residuals:

@@ -14,7 +14,7 @@ from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.points import voxel_means
 from segslam.core.trajectory import Poses
-from segslam.core.types import IndexPairs, Indices, Mask, Points, Transform, Vector
+from segslam.core.types import IndexPairs, Indices, Points, Transform, Vector
 from segslam.keyframes import is_known
 from segslam.odometry.checked import SIGNIFICANT
 from segslam.registration.refinement import LightSurface, downsample
@@ -81,18 +81,9 @@ def all_pairs(T_world: Poses, travel_m: Vector, covariances: Covariances, *, min
     passes = pairs_between_passes(T_world, travel_m, min_travel_m=min_travel_m)
     pairs = np.vstack([pairs_along(len(travel_m)), passes])
     pairs = pairs[np.lexsort((pairs[:, 0], pairs[:, 1]))]
-    return pairs[_are_known(pairs, covariances)]
-
-
-def _are_known(pairs: IndexPairs, covariances: Covariances) -> Mask:
-    """(k,) the pairs whose pose is known to the search distance of an alignment."""
-    return np.array(
-        [
-            geometry.chance_beyond(SEARCH_M[0], covariances(source, np.array([target]))[0]) < SIGNIFICANT
-            for target, source in pairs.tolist()
-        ],
-        dtype=bool,
-    )
+    between = (covariances(source, np.array([target]))[0] for target, source in pairs.tolist())
+    is_sure = [geometry.chance_beyond(SEARCH_M[0], covariance) < SIGNIFICANT for covariance in between]
+    return pairs[np.array(is_sure, dtype=bool)]
 
 
 def pairs_along(num_keyframes: int) -> IndexPairs:

@@ -22,7 +22,6 @@ from segslam.core.types import Points, Scan, Transform, Vector
 from segslam.keyframes import KeyframeSelector, downsample_keyframe
 from segslam.labels.label_files import unlabelled
 from segslam.odometry.kiss import KissOdometry
-from segslam.odometry.sweep import Odometry
 from segslam.registration.refinement import downsample
 from segslam.slam.adjustment.alignment import MIN_PAIRS, MOST_PAIRS, PointsOf, Shown, shown
 from segslam.slam.adjustment.submaps import surfaces_of
@@ -133,9 +132,9 @@ def measure_vertical_angle(
 class Calibrator:
     """Measures the vertical angle of the scans of one drive, without labels and map. It stores keyframes only."""
 
-    def __init__(self, config: Config, *, odometry: Odometry | None = None) -> None:
+    def __init__(self, config: Config) -> None:
         self._config = config
-        self._odometry = odometry or KissOdometry(config.odometry)
+        self._odometry = KissOdometry(config.odometry)
         self._selector = KeyframeSelector(config.keyframes)
         self._kept: list[tuple[Points, Transform, float]] = []
         """Points, pose and travel of each keyframe."""

@@ -70,9 +70,17 @@ def voxel_means(points: Points, voxel_m: float, *, beyond_m: float = -1.0, withi
 
 
 def group_means(rows: np.ndarray, group: Indices, num_groups: int) -> np.ndarray:
-    """Mean row of each group, float64; every group must have a row."""
+    """Mean row of each group, float64; zeros for an empty group."""
     sums = [np.bincount(group, weights=column, minlength=num_groups) for column in rows.T]
-    return np.column_stack(sums) / np.bincount(group, minlength=num_groups)[:, None]
+    return np.column_stack(sums) / np.maximum(np.bincount(group, minlength=num_groups), 1)[:, None]
+
+
+def group_moments(points: Points, group: Indices, num_groups: int) -> tuple[Points, Covariances]:
+    """Mean and covariance (normalised by n) of the points of each group; zeros for an empty group."""
+    means = group_means(points, group, num_groups)
+    centred = points - means[group]
+    products = (centred[:, :, None] * centred[:, None, :]).reshape(-1, 9)
+    return means, group_means(products, group, num_groups).reshape(-1, 3, 3)
 
 
 def radius_neighbours(points: Points, radius_m: float) -> Neighbours:

@@ -69,7 +69,7 @@ class PoseGraph:
     def __init__(self, config: GraphConfig) -> None:
         self._configured = config
         self._config = config
-        """The configuration with the measured noise of the odometry."""
+        """The configuration with the noise of the odometry that loops show."""
         self._odometry: list[Edge] = []
         self._rejected: list[bool] = []
         """For each motion: whether the last final optimisation rejected it."""
@@ -203,22 +203,17 @@ class PoseGraph:
         """
         return consistent_pairs(self._kept_odometry(), list(map(self._edge, closures)), self._inlier_bound)
 
-    def use_odometry_noise(self, sigma_m: float, sigma_deg: float) -> None:
-        """Use the odometry noise measured on this drive (per root metre), if it is above the configured noise.
+    def multiply_odometry_noise(self, factor: float) -> None:
+        """Increase the noise of odometry, from the next optimisation on, and of keyframes added later."""
+        sigma_m, sigma_deg = factor * self._config.odometry_sigma_m, factor * self._config.odometry_sigma_deg
+        update = {"odometry_sigma_m": sigma_m, "odometry_sigma_deg": sigma_deg}
+        self._use_noise_of(self._config.model_copy(update=update))
 
-        Motions that came with an information keep it. It takes effect with the next optimisation, and for keyframes
-        added later.
-        """
-        self._config = self._config.model_copy(
-            update={
-                "odometry_sigma_m": max(sigma_m, self._configured.odometry_sigma_m),
-                "odometry_sigma_deg": max(sigma_deg, self._configured.odometry_sigma_deg),
-            }
-        )
+    def _use_noise_of(self, config: GraphConfig) -> None:
+        """Motions that came with an information keep it."""
+        self._config = config
         self._odometry = [
-            edge
-            if own
-            else replace(edge, information=noise.odometry_information(float(way_m), edge.T_a_b, self._config))
+            edge if own else replace(edge, information=noise.odometry_information(float(way_m), edge.T_a_b, config))
             for edge, own, way_m in zip(self._odometry, self._has_own_information, np.diff(self.travel_m), strict=True)
         ]
         self._rebuild_backbone()
@@ -230,7 +225,7 @@ class PoseGraph:
         """
         factor = noise_factor(self._odometry, self._edge(closure))
         if factor > 1.0:
-            self._multiply_noise(factor)
+            self.multiply_odometry_noise(factor)
 
     def optimize(self, *, tolerance: float = RUNNING_TOLERANCE) -> GraphEstimate:
         """Optimise under the robust kernel from the last estimate, to this relative tolerance of the error."""
@@ -297,16 +292,16 @@ class PoseGraph:
         growth = np.column_stack([np.diff(self.travel_m), np.nan_to_num(np.diff(self._time_s.all()))])
         growth[np.array([self._has_own_information, self._rejected], dtype=bool).any(axis=0)] = 0.0
         raised = self._config
-        self.use_odometry_noise(0.0, 0.0)
+        self._use_noise_of(self._configured)
         found, odometry = None, self._kept_odometry()
         with suppress(Unsolvable):
             tolerated = raised.error_allowance
             found = steady_drift(self._prior, odometry, self._kept(), growth, self._values, tolerated=tolerated)
         if found is None:
-            self.use_odometry_noise(raised.odometry_sigma_m, raised.odometry_sigma_deg)
+            self._use_noise_of(raised)
             return False
         self._odometry = rotated(self._odometry, found.turns)
-        self._multiply_noise(found.noise_factor)
+        self.multiply_odometry_noise(found.noise_factor)
         self._take(found.values, self._weights)
         return True
 
@@ -337,9 +332,6 @@ class PoseGraph:
 
     def _kept_odometry(self) -> list[Edge]:
         return without(self._odometry, self._rejected)
-
-    def _multiply_noise(self, factor: float) -> None:
-        self.use_odometry_noise(factor * self._config.odometry_sigma_m, factor * self._config.odometry_sigma_deg)
 
     def _rebuild_backbone(self) -> None:
         self._backbone = joined(self._prior, factor_graph(self._kept_odometry()))

@@ -13,7 +13,7 @@ too few points to show its motion moves on as the last ones did.
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ from segslam.graph.edges import BREAK_M
 from segslam.graph.noise import odometry_information
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import LocalMap, SeenScan
-from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, Usual
+from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, is_usual
 from segslam.odometry.search import PoseSearch, Recover
 from segslam.odometry.sweep import Foreseeing, Odometry, OdometryResult
 from segslam.registration.refinement import MIN_POINTS, SHARED_NOISE_DEG, SHARED_NOISE_M
@@ -77,7 +77,9 @@ class CheckedOdometry:
         scans since then."""
         self._intervals = Intervals()
         self._motion = MotionModel()
-        self._usual_check, self._usual_fit = Usual(), Usual()
+        self._last_checks: deque[float] = deque(maxlen=WINDOW)
+        self._last_fits: deque[float] = deque(maxlen=WINDOW)
+        """How well the last scans were explained, when they were checked, and when they were registered."""
         self._T_odom_last = np.eye(4)
         self._T_odom_inner: Transform = np.eye(4)
         """Pose of the frame in which the inner odometry continues, undisturbed by small corrections."""
@@ -106,7 +108,7 @@ class CheckedOdometry:
         self._T_odom_last = T_odom_lidar
         if is_watched and motion.state is MotionState.REFINED:
             self._T_odom_inner = geometry.nearest_transform(T_odom_lidar @ geometry.inverse(proposed.T_odom_lidar))
-        return OdometryResult(T_odom_lidar, proposed.points, proposed.labels, proposed.intensities, motion)
+        return replace(proposed, T_odom_lidar=T_odom_lidar, motion=motion)
 
     @property
     def _is_watched(self) -> bool:
@@ -148,11 +150,11 @@ class CheckedOdometry:
         if found is None:
             return None
         off = _off(found.T_map_lidar, self._covariance(found), T_map_proposed)
-        is_usual = self._usual_check.includes(found.mean_log, least_spread=found.num_patches**-0.5)
         if off > MOST_OFF:
             return None
-        self._usual_check.note(found.mean_log)
-        if not is_usual:
+        fits_as_usual = _fits_as_usual(found, self._last_checks)
+        self._last_checks.append(found.mean_log)
+        if not fits_as_usual:
             return None
         if not self._inner.is_from_scans:
             return self._kept(proposed, found, is_unsure=False)
@@ -180,7 +182,7 @@ class CheckedOdometry:
                 if recognised and (not fits or search.log_ratio(recognised[0], fits[0]) >= 0.0):
                     fits, elsewhere, by_chance = recognised, 0.0, 0.0
         best = fits[0] if fits else self._map.fit(scan, T_map_proposed)
-        self._usual_fit.note(best.mean_log)
+        self._last_fits.append(best.mean_log)
         unsure = search.spread(self._fused(fits, gap)) + elsewhere * np.diag(ANYWHERE**2)
         is_unsure = bool(unsure[3:, 3:].max() > BREAK_M**2)
         if not self._inner.is_from_scans and (is_unsure or not self._contradicts(search, fits, proposed)):
@@ -317,7 +319,7 @@ class CheckedOdometry:
 
     def _is_usual(self, fits: Sequence[Fit]) -> bool:
         """True if the most likely pose explains the scan as usual; False if there is none."""
-        return bool(fits) and self._usual_fit.includes(fits[0].mean_log, least_spread=fits[0].num_patches ** -0.5)
+        return bool(fits) and _fits_as_usual(fits[0], self._last_fits)
 
     def _state(self, off: float, covariance: Information, *, is_unlikely: bool) -> MotionState:
         """Name of the result. `off`, which is noted, and `is_unlikely` compare the odometry's pose with the one kept.
@@ -367,6 +369,10 @@ class CheckedOdometry:
             return None
         half = np.linalg.inv(whiten) @ directions
         return np.linalg.inv(model + (half * np.maximum(excess, 0.0)) @ half.T)
+
+
+def _fits_as_usual(fit: Fit, last: Collection[float]) -> bool:
+    return is_usual(fit.mean_log, last, least_spread=fit.num_patches**-0.5)
 
 
 def _is_significant(search: PoseSearch, fit: Fit, other: Fit) -> bool:

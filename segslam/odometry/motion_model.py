@@ -9,7 +9,7 @@ the change is large.
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from statistics import median
 
 import numpy as np
@@ -51,26 +51,17 @@ class Intervals:
         self._last_ns = stamp_ns
 
 
-class Usual:
-    """The last values of a quantity, and whether another one is unusually small."""
+def is_usual(value: float, last: Collection[float], *, least_spread: float) -> bool:
+    """True if a value is not below the median of the last ones by more than three standard deviations.
 
-    def __init__(self) -> None:
-        self._values: deque[float] = deque(maxlen=WINDOW)
-
-    def includes(self, value: float, *, least_spread: float) -> bool:
-        """True if the value is not below the median by more than three standard deviations; False if none is known.
-
-        The standard deviation is that of a normal distribution with the same median absolute deviation.
-        """
-        if not self._values:
-            return False
-        middle = median(self._values)
-        spread = 1.4826 * median(abs(other - middle) for other in self._values)
-        return value >= middle - 3.0 * max(spread, least_spread)
-
-    def note(self, value: float) -> None:
-        """Add a value."""
-        self._values.append(value)
+    The standard deviation is that of a normal distribution with the same median absolute deviation. False if no value
+    is known.
+    """
+    if not last:
+        return False
+    middle = median(last)
+    spread = 1.4826 * median(abs(other - middle) for other in last)
+    return value >= middle - 3.0 * max(spread, least_spread)
 
 
 class MotionModel:
@@ -151,8 +142,8 @@ class MotionModel:
         """
         T_fused, gain, prior = self._fuse(T_last_lidar, measured, gap)
         regained = np.zeros(6) if prior is None else self._regained(T_fused, prior, gap)
-        if gap == 1.0:
-            self._learn(geometry.log(geometry.inverse(self.T_step) @ T_last_lidar), measured, prior)
+        if gap == 1.0 and (prior is None or (np.diag(measured) < np.diag(prior)).all()):  # else the scan shows it worse
+            self._changes.append(geometry.log(geometry.inverse(self.T_step) @ T_last_lidar))
         left = np.eye(6) - gain
         posterior = _posterior(gain, prior, measured)
         carried = np.zeros((6, 6)) if prior is None else self._accumulated @ left.T
@@ -200,11 +191,6 @@ class MotionModel:
         prior = prior + np.diag(np.repeat([change[:3] @ change[:3], change[3:] @ change[3:]], 3))
         gain = prior @ np.linalg.inv(prior + measured)
         return geometry.nearest_transform(T_predicted @ geometry.exp(gain @ change)), gain, prior
-
-    def _learn(self, change: np.ndarray, measured: Information, prior: Information | None) -> None:
-        """Learn how much motions change, in the directions that the scans observe better than the prediction."""
-        if prior is None or (np.diag(measured) < np.diag(prior)).all():
-            self._changes.append(change)
 
 
 def _posterior(gain: np.ndarray, prior: Information | None, measured: Information) -> Information:

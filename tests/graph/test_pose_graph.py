@@ -339,7 +339,7 @@ def test_a_motions_own_information_is_written(tmp_path: Path) -> None:
     graph = PoseGraph(CONFIG)
     graph.add_keyframe(0, np.eye(4), 0.0)
     graph.add_keyframe(1, TRUTH[1], 1.0, information=information)
-    graph.use_odometry_noise(1.0, 1.0)
+    graph.multiply_odometry_noise(100.0)
     graph.write_g2o(tmp_path / "graph.g2o")
     (edge,) = read_g2o(tmp_path / "graph.g2o").edges
     np.testing.assert_allclose(edge.information, information, atol=0.2, rtol=1e-3)
@@ -353,10 +353,10 @@ def test_a_motion_with_an_information_that_is_none_is_refused_and_not_added(valu
     assert graph.num_keyframes == 2
 
 
-def test_measured_odometry_noise_holds_for_all_motions_before_and_after(tmp_path: Path) -> None:
-    loose = GraphConfig(odometry_sigma_m=0.05, odometry_sigma_deg=0.3)
+def test_a_larger_odometry_noise_holds_for_all_motions_before_and_after(tmp_path: Path) -> None:
+    loose = GraphConfig(odometry_sigma_m=0.05, odometry_sigma_deg=0.1)
     expected, found = graph_of(DRIFT, TRUE_LOOPS, loose), graph_of(DRIFT[:100], [])
-    found.use_odometry_noise(0.05, 0.3)
+    found.multiply_odometry_noise(5.0)
     for i in range(100, 120):
         found.add_keyframe(i, DRIFT[i], float(travel_m(DRIFT)[i]))
     for loop in TRUE_LOOPS:
@@ -367,14 +367,6 @@ def test_measured_odometry_noise_holds_for_all_motions_before_and_after(tmp_path
     for name, graph in (("expected", expected), ("found", found)):
         graph.write_g2o(tmp_path / name)
     assert (tmp_path / "found").read_text() == (tmp_path / "expected").read_text()
-
-
-def test_measured_odometry_noise_is_never_below_the_configured() -> None:
-    plain, measured = graph_of(DRIFT, TRUE_LOOPS), graph_of(DRIFT, TRUE_LOOPS)
-    measured.use_odometry_noise(0.0, 1e-6)
-    plain.finish()
-    measured.finish()
-    np.testing.assert_array_equal(measured.T_world_keyframes, plain.T_world_keyframes)
 
 
 def test_odometry_noise_grows_with_the_way_and_with_turns() -> None:
@@ -503,7 +495,7 @@ def test_noise_that_loops_raise_does_not_make_later_motions_unsure() -> None:
     graph = PoseGraph(CONFIG)
     for number in range(6):
         if number == 3:
-            graph.use_odometry_noise(30.0 * CONFIG.odometry_sigma_m, CONFIG.odometry_sigma_deg)
+            graph.multiply_odometry_noise(30.0)
         graph.add_keyframe(number, geometry.transform(np.eye(3), [2.0 * number, 0.0, 0.0]), 2.0 * number)
     assert graph.motion_variance[0] == 0.0
     np.testing.assert_allclose(graph.motion_variance[2:], graph.motion_variance[1])

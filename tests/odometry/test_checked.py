@@ -19,7 +19,7 @@ from segslam.odometry.checked import CheckedOdometry, Proposed
 from segslam.odometry.kiss import KissOdometry
 from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.local_map import LocalMap, SeenScan
-from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, Usual, information_of
+from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, information_of
 from segslam.odometry.nudge import CHECK_VOXELS, nudge
 from segslam.odometry.search import PoseSearch, as_likely
 from segslam.odometry.sweep import GivenOdometry, OdometryResult
@@ -454,10 +454,11 @@ def test_a_fit_below_the_last_ones_is_searched_around_however_much_the_checks_va
     T_odom_lidar = geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[SLIP_AT]
     seen = SeenScan(scans[SLIP_AT].points, CONFIG.refine)
     found = odometry._map.fit(seen, geometry.inverse(odometry._map.T_odom_map) @ T_odom_lidar)
-    odometry._usual_fit, odometry._usual_check = Usual(), Usual()
+    odometry._last_fits.clear()
+    odometry._last_checks.clear()
     for sign in (-1.0, 1.0):
-        odometry._usual_fit.note(found.mean_log + 1.0)
-        odometry._usual_check.note(sign * spread)
+        odometry._last_fits.append(found.mean_log + 1.0)
+        odometry._last_checks.append(sign * spread)
     searched: list[object] = []
     monkeypatch.setattr(PoseSearch, "log_odds", lambda *_: 1.0)
     monkeypatch.setattr(PoseSearch, "around", lambda search, *_: searched.append(search) or [])
@@ -497,7 +498,7 @@ def test_a_registration_that_leads_away_from_its_start_is_compared_with_others(m
     scans, truth = round_drive()
     odometry = _checked(_slipped(metres=3.0))
     last = _registered(odometry, scans[:SLIP_AT])[-1]
-    usual = float(np.median(odometry._usual_fit._values))
+    usual = float(np.median(odometry._last_fits))
 
     before, now = truth.T_world_lidar[SLIP_AT - 1 : SLIP_AT + 1]
 
@@ -518,7 +519,7 @@ def test_a_motion_is_unsure_by_the_distance_of_two_poses_that_explain_the_scan_a
     scans, truth = round_drive()
     odometry = _checked(_slipped(metres=3.0))
     _registered(odometry, scans[:SLIP_AT])
-    usual = float(np.median(odometry._usual_fit._values))
+    usual = float(np.median(odometry._last_fits))
     T_before_now = geometry.inverse(truth.T_world_lidar[SLIP_AT - 1]) @ truth.T_world_lidar[SLIP_AT]
 
     def two(search: PoseSearch, starts: object, known: object = ()) -> list[Fit]:

@@ -9,12 +9,12 @@ from helpers.real_scans import raw_scan
 
 from segslam.core import geometry
 from segslam.core.config import SegregatorConfig, load_config
+from segslam.core.points import group_moments
 from segslam.core.types import Label
 from segslam.registration.segregator.clusters import (
     DCVC_AZIMUTH_DEG,
     Clusters,
     curved_voxel_clusters,
-    gaussians,
     semantic_clusters,
 )
 
@@ -92,7 +92,7 @@ def test_what_the_authors_program_splits_depends_on_the_order_of_its_points(data
     counts = np.bincount(theirs)
     large = np.flatnonzero(counts >= AUTHORS.cluster_min_points[CLASSES[name]])
     kept = np.isin(theirs, large)
-    twin = gaussians(points[kept].astype(float), np.searchsorted(large, theirs[kept]), len(large))
+    twin = group_moments(points[kept].astype(float), np.searchsorted(large, theirs[kept]), len(large))
     means, covariances, sizes = golden(data_dir, scan, name)
     assert len(large) == len(means)
     assert equal_rows(Clusters(*twin, np.empty(0, np.uint8), counts[large]), means, covariances, sizes).all()

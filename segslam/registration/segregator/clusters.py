@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from segslam.core import geometry
 from segslam.core.config import SegregatorConfig
-from segslam.core.points import canonical_order, group_means, within_range
+from segslam.core.points import canonical_order, group_moments, within_range
 from segslam.core.types import Covariances, Indices, Label, Labels, Points, Vector
 
 DCVC_START_RADIUS_M = 0.35
@@ -89,21 +89,13 @@ def curved_voxel_clusters(points: Points, *, pitch_deg: float) -> Indices:
     return _components(keys, num_radial, num_azimuth)[voxel]
 
 
-def gaussians(points: Points, group: Indices, num_groups: int) -> tuple[Points, Covariances]:
-    """Mean and covariance (normalised by n) of the points of each group. A group has a point at least."""
-    means = group_means(points, group, num_groups)
-    centred = points - means[group]
-    products = (centred[:, :, None] * centred[:, None, :]).reshape(-1, 9)
-    return means, group_means(products, group, num_groups).reshape(-1, 3, 3)
-
-
 def _class_clusters(points: Points, label: Label, min_points: int, config: SegregatorConfig) -> Clusters:
     cluster = curved_voxel_clusters(points, pitch_deg=config.dcvc_pitch_deg)
     sizes = np.bincount(cluster)
     large = sizes >= min_points
     renumbered = np.cumsum(large) - 1
     kept = large[cluster]
-    means, covariances = gaussians(points[kept], renumbered[cluster[kept]], int(large.sum()))
+    means, covariances = group_moments(points[kept], renumbered[cluster[kept]], int(large.sum()))
     area = sizes[large] * (means**2).sum(axis=1)
     order = np.lexsort((*means.T, -area))[: config.max_clusters_per_class]
     return Clusters(means[order], covariances[order], np.full(len(order), label, np.uint8), sizes[large][order])

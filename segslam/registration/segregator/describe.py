@@ -24,7 +24,14 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from segslam.core.config import SegregatorConfig
-from segslam.core.points import normals, patch_covariances, radius_neighbours, voxel_means, within_range
+from segslam.core.points import (
+    group_means,
+    normals,
+    patch_covariances,
+    radius_neighbours,
+    voxel_means,
+    within_range,
+)
 from segslam.core.types import GROUND_LABELS, Covariances, Description, Indices, Label, Labels, Mask, Points
 from segslam.registration.segregator.clusters import MAX_RANGE_M, MIN_RANGE_M, Clusters, semantic_clusters
 from segslam.registration.segregator.fpfh import fpfh
@@ -184,5 +191,4 @@ def _cell_means(ground: Points, rows: np.ndarray, reach_m: float, cell_m: float)
     i, j = ((ground[:, :2] + reach_m) / cell_m).astype(np.int64).T
     cell = i * math.ceil(2.0 * reach_m / cell_m) + j
     counts = np.bincount(cell)
-    sums = np.column_stack([np.bincount(cell, column) for column in rows.T])
-    return sums[counts > 0] / counts[counts > 0, None], counts[counts > 0]
+    return group_means(rows, cell, len(counts))[counts > 0], counts[counts > 0]

@@ -7,14 +7,13 @@ are right. The patch and its normal come from one scan alone, so that a bad pose
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Float
 from scipy.stats import wilcoxon
 
 from segslam.core import geometry
-from segslam.core.points import cell_keys, within_range
+from segslam.core.points import cell_keys, group_moments, within_range
 from segslam.core.processes import in_parts
 from segslam.core.trajectory import Poses
-from segslam.core.types import IndexPairs, Indices, Points, Transform, Vector
+from segslam.core.types import IndexPairs, Points, Transform, Vector
 from segslam.odometry.checked import SIGNIFICANT
 
 CELL_M = 1.0
@@ -79,7 +78,7 @@ def patch_thickness_m(points_a: Points, points_b: Points, T_a_b: Transform) -> V
     in_a, in_b = cell[: len(a)], cell[len(a) :]
     num = int(cell.max(initial=-1)) + 1
     counts = np.column_stack([np.bincount(in_a, minlength=num), np.bincount(in_b, minlength=num)])
-    means, covariances = _moments(a, in_a, num)
+    means, covariances = group_moments(a, in_a, num)
     shared = np.flatnonzero((counts >= MIN_POINTS).all(axis=1))
     variances, directions = np.linalg.eigh(covariances[shared])
     flat = variances[:, 0] < FLAT**2 * variances[:, 1]
@@ -89,15 +88,3 @@ def patch_thickness_m(points_a: Points, points_b: Points, T_a_b: Transform) -> V
     first, second = (np.bincount(cell, heights**power, num)[shared[flat]] for power in (1, 2))
     total = counts.sum(axis=1)[shared[flat]]
     return np.sqrt(np.maximum(second / total - (first / total) ** 2, 0.0))
-
-
-def _moments(points: Points, cell: Indices, num: int) -> tuple[Points, Float[np.ndarray, "n 3 3"]]:
-    """Mean and covariance of the points in each cell; zeros for an empty cell."""
-    count = np.maximum(np.bincount(cell, minlength=num), 1)
-    means = np.column_stack([np.bincount(cell, column, num) for column in points.T]) / count[:, None]
-    centred = points - means[cell]
-    covariances = np.empty((num, 3, 3))
-    for i in range(3):
-        for j in range(3):
-            covariances[:, i, j] = np.bincount(cell, centred[:, i] * centred[:, j], num) / count
-    return means, covariances

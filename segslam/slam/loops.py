@@ -43,14 +43,7 @@ class LoopCloser:
     """Proposes loops from the poses of the graph, and adds the verified ones to the graph."""
 
     def __init__(
-        self,
-        config: Config,
-        graph: Graph,
-        clouds: CloudOf,
-        labeller: Labeller,
-        edits: LoopEdits,
-        *,
-        is_known: bool,
+        self, config: Config, graph: Graph, clouds: CloudOf, labeller: Labeller, edits: LoopEdits, *, is_known: bool
     ) -> None:
         """`clouds` provides the points of keyframes; `labeller` computes geometric labels of gathered clouds.
 
@@ -95,11 +88,7 @@ class LoopCloser:
         """Propose and try loops for a keyframe; with `below`, only with smaller ids, those of earlier sessions."""
         with watch("propose"):
             candidates = self.detector.candidates(
-                keyframe_id,
-                self._graph.T_world_keyframes,
-                self._graph.travel_m,
-                self._graph.covariances,
-                below=below,
+                keyframe_id, self._graph.T_world_keyframes, self._graph.travel_m, self._graph.covariances, below=below
             )
         added = sorted(older_id for newer_id, older_id in self._edits.added if newer_id == keyframe_id)
         by_hand = [self._far.candidate(keyframe_id, older_id) for older_id in added]

@@ -100,10 +100,7 @@ def recognise(
 
 
 def spread(
-    place_ids: Sequence[int],
-    T_world_place: Callable[[int], Transform],
-    apart_m: float,
-    taken: Sequence[Transform] = (),
+    place_ids: Sequence[int], T_world_place: Callable[[int], Transform], apart_m: float, taken: Sequence[Transform] = ()
 ) -> Iterator[int]:
     """The places that are at least so far from all before, and from those that are taken already."""
     taken = list(taken)

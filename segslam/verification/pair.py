@@ -59,12 +59,7 @@ def register(
 
 
 def register_prepared(
-    source: PreparedScan,
-    target: PreparedScan,
-    *,
-    config: Config,
-    gate: Gate = anywhere,
-    watch: Stopwatch | None = None,
+    source: PreparedScan, target: PreparedScan, *, config: Config, gate: Gate = anywhere, watch: Stopwatch | None = None
 ) -> Alignment | Rejected:
     """The refined and verified pose of the source in the target without an initial guess, or the reason of rejection.
 
@@ -131,12 +126,7 @@ def _outcome(trial: Trial, coarse: Registration, found: Sequence[Found]) -> Foun
 
 
 def register_near(
-    source: PreparedScan,
-    target: PreparedScan,
-    T_target_source: Transform,
-    *,
-    config: Config,
-    watch: Stopwatch,
+    source: PreparedScan, target: PreparedScan, T_target_source: Transform, *, config: Config, watch: Stopwatch
 ) -> Alignment | Rejected:
     """The refined and verified pose near one that is known to `KNOWN_M` and `KNOWN_RAD`; no other poses are tried.
 

@@ -24,14 +24,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from segslam.core.config import SegregatorConfig
-from segslam.core.points import (
-    group_means,
-    normals,
-    patch_covariances,
-    radius_neighbours,
-    voxel_means,
-    within_range,
-)
+from segslam.core.points import group_means, normals, patch_covariances, radius_neighbours, voxel_means, within_range
 from segslam.core.types import GROUND_LABELS, Covariances, Description, Indices, Label, Labels, Mask, Points
 from segslam.registration.segregator.clusters import MAX_RANGE_M, MIN_RANGE_M, Clusters, semantic_clusters
 from segslam.registration.segregator.fpfh import fpfh

@@ -80,9 +80,7 @@ def align_gaussians(
         num_inliers=len(rows),
         rms_m=float(np.sqrt(np.mean(np.sum(gaps**2, axis=1)))),
         information=geometry.with_noise(
-            information,
-            rotation_rad=math.radians(SHARED_NOISE_DEG),
-            translation_m=SHARED_NOISE_M,
+            information, rotation_rad=math.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M
         ),
     )
 

@@ -91,12 +91,7 @@ def solve_decoupled(source: Points, target: Points, align: AlignRotation, *, bou
 
 
 def solve_level(
-    source: Points,
-    target: Points,
-    source_up: Direction,
-    target_up: Direction,
-    *,
-    bound_m: float,
+    source: Points, target: Points, source_up: Direction, target_up: Direction, *, bound_m: float
 ) -> Transform | Rejected:
     """The pose that aligns the two verticals and minimises the truncated cost of the points projected to the ground.
 

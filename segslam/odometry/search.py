@@ -16,7 +16,7 @@ from segslam.keyframes import DENSE_VOXELS
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import SEARCH_VOXELS_GICP, LocalMap, SeenScan
 from segslam.odometry.nudge import SEARCH_VOXELS
-from segslam.verification import log_odds, most_log_odds
+from segslam.verification import patches, score
 
 Recover = Callable[[Points, Points], Alignment | Rejected]
 """Registers a source (n, 3) with a target (m, 3) without initial guess, and verifies the result."""
@@ -32,15 +32,11 @@ NUM_REGISTERED = 3
 """Chosen: number of the most probable of these that are registered with all points."""
 
 
-def unknown(fit: Fit) -> float:
-    """Any motion is as probable."""
-    return 0.0
-
-
 class PoseSearch:
     """The search for the pose of one scan in a local map."""
 
-    def __init__(self, local: LocalMap, scan: SeenScan, *, prior: Prior = unknown) -> None:
+    def __init__(self, local: LocalMap, scan: SeenScan, *, prior: Prior = lambda fit: 0.0) -> None:
+        """By default, any motion is as probable."""
         self._local, self._scan, self._prior = local, scan, prior
         self._same_m = SEARCH_VOXELS_GICP[-1] * local.voxel_m
         self.far_m = SEARCH_VOXELS[0] * local.voxel_m
@@ -93,7 +89,7 @@ class PoseSearch:
         """Log odds that a pose is right, by the score of loops (nats)."""
         if fit.log_odds is not None:
             return fit.log_odds
-        return log_odds(self._scan.observed, self._local.observed, fit.T_map_lidar)
+        return score.shipped().log_odds(patches.counts_at(self._scan.observed, self._local.observed, fit.T_map_lidar))
 
     def log_ratio(self, fit: Fit, other: Fit) -> float:
         """How much more probable the scan makes a pose than another, whatever the last motions were (nats)."""
@@ -135,7 +131,7 @@ class PoseSearch:
         judged: list[Fit] = []
         for fit in kept:
             last = judged[num_ordered - 1] if len(judged) >= num_ordered else None
-            if last and _log_posterior(last) > _log_without_score(fit) + most_log_odds():
+            if last and _log_posterior(last) > _log_without_score(fit) + score.shipped().most_log_odds:
                 break  # no score brings this pose or a later one before it
             judged.append(replace(fit, log_odds=self.log_odds(fit)))
             judged.sort(key=lambda each: -_log_posterior(each))

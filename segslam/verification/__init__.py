@@ -1,5 +1,5 @@
 """Two scans to a verified pose: hypotheses of registration are refined, judged by a score, and compared with others."""
 
-from segslam.verification.pair import log_odds, most_log_odds, register, register_near, register_prepared
+from segslam.verification.pair import register, register_near, register_prepared
 
-__all__ = ["log_odds", "most_log_odds", "register", "register_near", "register_prepared"]
+__all__ = ["register", "register_near", "register_prepared"]

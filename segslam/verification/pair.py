@@ -21,8 +21,7 @@ from segslam.core.types import (
 )
 from segslam.labels import geometric_labels
 from segslam.registration import refinement
-from segslam.registration.prepared import Observed, PreparedScan, prepare_scan
-from segslam.verification import patches, score
+from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification.rivals import is_same, rivals_of
 from segslam.verification.trial import EQUAL_M, EQUAL_RAD, MAX_COARSE_FINE_M, Found, Gate, Trial, anywhere, judged
 
@@ -143,13 +142,3 @@ def register_near(
         return Rejected(RejectReason.FAR_FROM_PRIOR, detail)
     coarse = replace(fine, T_target_source=T_target_source, num_inliers=0, num_correspondences=0)
     return judged(trial.found(coarse, fine), None, config=config)
-
-
-def log_odds(source: Observed, target: Observed, T_target_source: Transform) -> float:
-    """Log odds that a pose of the source in the target is right, by what their patches show there (nats)."""
-    return score.shipped().log_odds(patches.counts_at(source, target, T_target_source))
-
-
-def most_log_odds() -> float:
-    """The log odds that no pose exceeds (nats)."""
-    return score.shipped().most_log_odds

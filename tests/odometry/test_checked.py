@@ -415,11 +415,11 @@ def test_poses_that_no_score_brings_among_the_first_are_not_scored(monkeypatch: 
         for fit, value in zip([*likely, *unlikely], (1.0, 3.0, 2.0, 0.0, *[30.0] * 4), strict=True)
     }
 
-    def scored_by(source: object, target: object, T_map_lidar: np.ndarray) -> float:
-        scored.append(T_map_lidar)
-        return odds[id(T_map_lidar)]
+    def scored_by(search: PoseSearch, fit: Fit) -> float:
+        scored.append(fit.T_map_lidar)
+        return odds[id(fit.T_map_lidar)]
 
-    monkeypatch.setattr("segslam.odometry.search.log_odds", scored_by)
+    monkeypatch.setattr(PoseSearch, "log_odds", scored_by)
     order = search._compared([*unlikely, *likely], num_ordered=3)
     assert [id(fit.T_map_lidar) for fit in order[:4]] == [id(likely[number].T_map_lidar) for number in (1, 2, 0, 3)]
     assert len(order) == 8

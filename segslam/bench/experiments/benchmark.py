@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
 from itertools import islice
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from segslam.bench.experiments.job import Job, failed_row, register_trial, shared_scan
-from segslam.bench.experiments.pairs import ScanVariant, Trial
+from segslam.bench.experiments.pairs import Trial
 from segslam.bench.experiments.rows import LOST_WORKER, Row, append_rows, grouped, read_rows, write_rows
 from segslam.core.errors import reason
 from segslam.core.types import SegslamError
@@ -20,7 +19,7 @@ from segslam.run.fleets.workers import cluster
 ROWS_FILE = "details.csv"
 IDENTITY_FILE = "asked.json"
 NUM_SCANS_KEPT = 128
-"""Chosen: scans kept in one process, up to 15 MB each with all methods; consecutive pairs of a drive reuse scans."""
+"""Chosen: scans kept in memory, up to 15 MB each with all methods; consecutive pairs of a drive reuse scans."""
 PAIRS_AHEAD = 8
 """Pairs submitted per worker: enough that no worker idles, few enough that their scans fit in memory."""
 
@@ -40,7 +39,7 @@ def run(
     folder continues where it stopped; raises SegslamError if the folder contains another benchmark.
     """
     done = _rows_before(folder, job, trials) if folder else []
-    tried = grouped(done, lambda row: row.key[:3])
+    tried = grouped(done, lambda row: row.trial_key)
     left = [trial for trial in trials if trial.key not in tried]
     if folder:
         write_rows(folder / ROWS_FILE, done)
@@ -54,7 +53,7 @@ def run(
 def in_order(rows: Sequence[Row], job: Job, trials: Sequence[Trial]) -> list[Row]:
     """The rows in the order of a single process, whatever the order in which they were finished."""
     place = {trial.key: number for number, trial in enumerate(trials)}
-    return sorted(rows, key=lambda row: (place[row.key[:3]], job.methods.index(row.method)))
+    return sorted(rows, key=lambda row: (place[row.trial_key], job.methods.index(row.method)))
 
 
 def _work(job: Job, trials: Sequence[Trial], workers: int, scheduler: str | None) -> Iterator[list[Row]]:
@@ -75,35 +74,25 @@ def _run_on(client: Any, job: Job, trials: Sequence[Trial]) -> Iterator[list[Row
     """
     from distributed import KilledWorker, as_completed
 
-    uses = Counter(variant for trial in trials for variant in (trial.source, trial.target))
-    scans: dict[ScanVariant, Any] = {}
+    submit = partial(client.submit, pure=False)
+    prepared = lru_cache(NUM_SCANS_KEPT)(partial(submit, shared_scan, job))  # the cluster frees a scan that leaves it
 
-    def prepared(variant: ScanVariant) -> Any:
-        if variant not in scans:
-            scans[variant] = client.submit(shared_scan, job, variant, pure=False)
-        return scans[variant]
-
-    def submit(trial: Trial) -> Any:
-        future = client.submit(register_trial, job, trial, prepared(trial.source), prepared(trial.target), pure=False)
-        pending[future.key] = trial
+    def registered(trial: Trial) -> Any:
+        future = submit(register_trial, job, trial, prepared(trial.source), prepared(trial.target))
+        trial_of[future.key] = trial
         return future
 
-    pending: dict[str, Trial] = {}
-    waiting = iter(trials)
+    trial_of: dict[str, Trial] = {}
+    waiting = map(registered, trials)
     ahead = PAIRS_AHEAD * max(sum(client.nthreads().values()), 1)
-    running = as_completed([submit(trial) for trial in islice(waiting, ahead)])
+    running = as_completed(islice(waiting, ahead))
     for future in running:
-        trial = pending.pop(future.key)
+        trial = trial_of.pop(future.key)
         try:
             rows = future.result()
         except KilledWorker:
             rows = [failed_row(method, trial, LOST_WORKER) for method in job.methods]
-        for variant in (trial.source, trial.target):
-            uses[variant] -= 1
-            if not uses[variant]:
-                scans.pop(variant, None)  # the cluster frees the scan
-        for following in islice(waiting, 1):
-            running.add(submit(following))
+        running.update(islice(waiting, 1))
         yield rows
 
 
@@ -126,7 +115,7 @@ def _rows_before(folder: Path, job: Job, trials: Sequence[Trial]) -> list[Row]:
         if before.get(key) != identity[key]:
             raise SegslamError(f"{folder}: contains a benchmark with other {key}; choose another --out, or delete it")
     rows = read_rows(folder / ROWS_FILE) if (folder / ROWS_FILE).exists() else []
-    trials_before = grouped([row for row in rows if row.reason != LOST_WORKER], lambda row: row.key[:3]).values()
+    trials_before = grouped([row for row in rows if row.reason != LOST_WORKER], lambda row: row.trial_key).values()
     return [row for some in trials_before if {one.method for one in some} == set(job.methods) for row in some]
 
 

@@ -1,7 +1,6 @@
 """One row per registration, written to a CSV file at once and read to resume a benchmark; statistics of rows."""
 
 import csv
-import math
 from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TextIO
@@ -58,21 +57,16 @@ class Row(BaseModel):
     @property
     def success(self) -> bool:
         """True for an error below 2 m and 5 degrees, the paper's criterion."""
-        return self.accepted and self.error.success
-
-    @property
-    def error(self) -> PoseError:
-        """Infinite where no pose was given."""
         if self.error_m is None or self.error_deg is None:
-            return PoseError(math.inf, math.inf)
-        return PoseError(self.error_m, self.error_deg)
+            return False
+        return self.accepted and PoseError(self.error_m, self.error_deg).success
 
     @property
-    def key(self) -> tuple[str, ScanVariant, ScanVariant, str]:
-        """Identifies the trial and the method."""
+    def trial_key(self) -> tuple[str, ScanVariant, ScanVariant]:
+        """The key of the row's `Trial`."""
         source = ScanVariant(self.source, self.source_yaw_deg, self.source_lost, self.draw if self.source_lost else 0)
         target = ScanVariant(self.target, 0.0, self.target_lost, self.draw if self.target_lost else 0)
-        return self.pairs, source, target, self.method
+        return self.pairs, source, target
 
     @property
     def estimate(self) -> Transform | None:

@@ -85,11 +85,7 @@ def trajectory_metrics(estimate: Poses, reference: Poses, *, up: tuple[float, fl
     absolute = pose_errors(aligned, reference)
     relative = motion_errors(estimate, reference, np.s_[:-1], np.s_[1:])
     ate_m = rms(absolute.translation_m)
-    metrics = {
-        "ate_m": ate_m,
-        "rpe_m": rms(relative.translation_m),
-        "rpe_deg": rms(relative.rotation_deg),
-    }
+    metrics = {"ate_m": ate_m, "rpe_m": rms(relative.translation_m), "rpe_deg": rms(relative.rotation_deg)}
     turn_deg = _turn_about_line_deg(reference[:, :3, 3], ate_m)
     if turn_deg < LINE_TURN_DEG:
         metrics["are_deg"] = rms(absolute.rotation_deg)

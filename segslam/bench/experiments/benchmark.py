@@ -25,12 +25,7 @@ PAIRS_AHEAD = 8
 
 
 def run(
-    job: Job,
-    trials: Sequence[Trial],
-    *,
-    workers: int = 1,
-    scheduler: str | None = None,
-    folder: Path | None = None,
+    job: Job, trials: Sequence[Trial], *, workers: int = 1, scheduler: str | None = None, folder: Path | None = None
 ) -> Iterator[list[Row]]:
     """Yields the rows of each trial when it is finished, starting with those already in the folder.
 

@@ -93,12 +93,7 @@ class Placer:
         return outcome
 
     def _registered(
-        self,
-        keyframe_id: int,
-        own: Observed,
-        target_id: int,
-        T_world_predicted: Transform,
-        watch: Stopwatch,
+        self, keyframe_id: int, own: Observed, target_id: int, T_world_predicted: Transform, watch: Stopwatch
     ) -> Placement | Rejected:
         with watch("prepare"):
             target = self._map_seen(target_id)

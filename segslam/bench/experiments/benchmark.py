@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import lru_cache, partial
 from itertools import islice
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from segslam.bench.experiments.job import Job, failed_row, register_trial, shared_scan
-from segslam.bench.experiments.pairs import Trial
+from segslam.bench.experiments.pairs import ScanVariant, Trial
 from segslam.bench.experiments.rows import LOST_WORKER, Row, append_rows, grouped, read_rows, write_rows
 from segslam.core.errors import reason
 from segslam.core.types import SegslamError
@@ -19,7 +20,7 @@ from segslam.run.fleets.workers import cluster
 ROWS_FILE = "details.csv"
 IDENTITY_FILE = "asked.json"
 NUM_SCANS_KEPT = 128
-"""Chosen: scans kept in memory, up to 15 MB each with all methods; consecutive pairs of a drive reuse scans."""
+"""Chosen: scans kept in one process, up to 15 MB each with all methods; consecutive pairs of a drive reuse scans."""
 PAIRS_AHEAD = 8
 """Pairs submitted per worker: enough that no worker idles, few enough that their scans fit in memory."""
 
@@ -69,25 +70,35 @@ def _run_on(client: Any, job: Job, trials: Sequence[Trial]) -> Iterator[list[Row
     """
     from distributed import KilledWorker, as_completed
 
-    submit = partial(client.submit, pure=False)
-    prepared = lru_cache(NUM_SCANS_KEPT)(partial(submit, shared_scan, job))  # the cluster frees a scan that leaves it
+    uses = Counter(variant for trial in trials for variant in (trial.source, trial.target))
+    scans: dict[ScanVariant, Any] = {}
 
-    def registered(trial: Trial) -> Any:
-        future = submit(register_trial, job, trial, prepared(trial.source), prepared(trial.target))
-        trial_of[future.key] = trial
+    def prepared(variant: ScanVariant) -> Any:
+        if variant not in scans:
+            scans[variant] = client.submit(shared_scan, job, variant, pure=False)
+        return scans[variant]
+
+    def submit(trial: Trial) -> Any:
+        future = client.submit(register_trial, job, trial, prepared(trial.source), prepared(trial.target), pure=False)
+        pending[future.key] = trial
         return future
 
-    trial_of: dict[str, Trial] = {}
-    waiting = map(registered, trials)
+    pending: dict[str, Trial] = {}
+    waiting = iter(trials)
     ahead = PAIRS_AHEAD * max(sum(client.nthreads().values()), 1)
-    running = as_completed(islice(waiting, ahead))
+    running = as_completed([submit(trial) for trial in islice(waiting, ahead)])
     for future in running:
-        trial = trial_of.pop(future.key)
+        trial = pending.pop(future.key)
         try:
             rows = future.result()
         except KilledWorker:
             rows = [failed_row(method, trial, LOST_WORKER) for method in job.methods]
-        running.update(islice(waiting, 1))
+        for variant in (trial.source, trial.target):
+            uses[variant] -= 1
+            if not uses[variant]:
+                scans.pop(variant, None)  # the cluster frees the scan
+        for following in islice(waiting, 1):
+            running.add(submit(following))
         yield rows
 
 

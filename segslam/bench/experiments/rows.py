@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from segslam.bench.experiments.pairs import ScanVariant
-from segslam.core.evaluation import PoseError
+from segslam.core.evaluation import SUCCESS_DEG, SUCCESS_M
 from segslam.core.types import SegslamError, Transform
 from segslam.core.whole_files import cannot_write, whole_file
 
@@ -59,7 +59,7 @@ class Row(BaseModel):
         """True for an error below 2 m and 5 degrees, the paper's criterion."""
         if self.error_m is None or self.error_deg is None:
             return False
-        return self.accepted and PoseError(self.error_m, self.error_deg).success
+        return self.accepted and self.error_m < SUCCESS_M and self.error_deg < SUCCESS_DEG
 
     @property
     def trial_key(self) -> tuple[str, ScanVariant, ScanVariant]:

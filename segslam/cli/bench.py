@@ -309,7 +309,7 @@ def _pictures(job: "Job", trials: list["Trial"], rows: list["Row"], count: int) 
     trial_of = {trial.key: trial for trial in trials}
     pictures = {}
     for row in worst_failures([row for row in rows if row.reason != BAD_SCAN], count):
-        trial = trial_of[row.key[:3]]
+        trial = trial_of[row.trial_key]
         outcome = f"error {row.error_m:.1f} m {row.error_deg:.1f} deg" if row.accepted else row.reason.replace("_", " ")
         turned = f", rotated by {row.source_yaw_deg:g} deg" if row.source_yaw_deg else ""
         lost = f", {100 * row.source_lost:g} % of labels lost" if row.source_lost else ""

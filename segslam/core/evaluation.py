@@ -38,28 +38,6 @@ REVISIT_MIN_TRAVEL_M = 50.0
 FOUND_WITHIN_M = 10.0  # chosen: a closure corrects the drift of revisits within this travel
 
 
-@dataclass(frozen=True, slots=True)
-class PoseError:
-    """Error of one pose."""
-
-    translation_m: float
-    rotation_deg: float
-
-    @classmethod
-    def of(cls, T_error: Transform) -> "PoseError":
-        """Length and angle of a transform that is the identity where there is no error."""
-        return cls(geometry.distance(T_error), math.degrees(geometry.angle(T_error)))
-
-    def within(self, translation_m: float, rotation_deg: float) -> bool:
-        """Whether both errors are below these."""
-        return self.translation_m < translation_m and self.rotation_deg < rotation_deg
-
-    @property
-    def success(self) -> bool:
-        """By the rule of the Segregator paper."""
-        return self.within(SUCCESS_M, SUCCESS_DEG)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseErrors:
     """Errors of each row (m, degrees)."""
@@ -85,11 +63,7 @@ def trajectory_metrics(estimate: Poses, reference: Poses, *, up: tuple[float, fl
     absolute = pose_errors(aligned, reference)
     relative = motion_errors(estimate, reference, np.s_[:-1], np.s_[1:])
     ate_m = rms(absolute.translation_m)
-    metrics = {
-        "ate_m": ate_m,
-        "rpe_m": rms(relative.translation_m),
-        "rpe_deg": rms(relative.rotation_deg),
-    }
+    metrics = {"ate_m": ate_m, "rpe_m": rms(relative.translation_m), "rpe_deg": rms(relative.rotation_deg)}
     turn_deg = _turn_about_line_deg(reference[:, :3, 3], ate_m)
     if turn_deg < LINE_TURN_DEG:
         metrics["are_deg"] = rms(absolute.rotation_deg)

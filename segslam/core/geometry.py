@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core.types import Direction, Information, Points, Rotation, Tangent, Transform, Vector
@@ -23,6 +24,14 @@ def transform(rotation: Rotation, translation: Triple) -> Transform:
     return T_a_b
 
 
+def transforms(rotations: np.ndarray, translations: Points) -> Float[np.ndarray, "_ 4 4"]:
+    """The 4x4 matrices of rotations (n, 3, 3), or of one for all, and translations (n, 3) (m)."""
+    T_a_b = np.tile(np.eye(4), (len(translations), 1, 1))
+    T_a_b[:, :3, :3] = rotations
+    T_a_b[:, :3, 3] = translations
+    return T_a_b
+
+
 def apply(T_a_b: Transform, points_b: Points) -> Points:
     """Points (n, 3) of frame b in frame a."""
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
@@ -32,6 +41,11 @@ def inverse(T_a_b: Transform) -> Transform:
     """T_b_a."""
     R_b_a = T_a_b[:3, :3].T
     return transform(R_b_a, -R_b_a @ T_a_b[:3, 3])
+
+
+def unit_rows(vectors: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+    """Each vector at unit length; one that is shorter than 1e-9 stays shorter than 1."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9)
 
 
 def yaw(angle_rad: float) -> Rotation:

@@ -192,10 +192,7 @@ def _start(modules: Sequence[str], pipe: int, *, backwards: bool) -> subprocess.
     code = f"from segslam.core.kernels import _build; _build({list(modules)}, backwards={backwards})"
     path = os.pathsep.join([str(PACKAGE.parent), *filter(None, sys.path)])
     return subprocess.Popen(
-        [sys.executable, "-c", code],
-        stdout=pipe,
-        stderr=subprocess.STDOUT,
-        env=os.environ | {"PYTHONPATH": path},
+        [sys.executable, "-c", code], stdout=pipe, stderr=subprocess.STDOUT, env=os.environ | {"PYTHONPATH": path}
     )
 
 

@@ -243,16 +243,15 @@ def _numbers(fields: list[str], format: PoseFormat) -> list[float]:
 
 def _from_matrices(rows: np.ndarray) -> tuple[Poses, Vector]:
     """The poses, and the distance of each 3x3 part from a rotation."""
-    matrices, poses = rows.reshape(-1, 3, 4), np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = [geometry.nearest_rotation(matrix) for matrix in matrices[:, :, :3]]
-    poses[:, :3, 3] = matrices[:, :, 3]
-    return poses, np.abs(matrices[:, :, :3] - poses[:, :3, :3]).max(axis=(1, 2))
+    matrices = rows.reshape(-1, 3, 4)
+    rotations = np.array([geometry.nearest_rotation(matrix) for matrix in matrices[:, :, :3]])
+    off = np.abs(matrices[:, :, :3] - rotations).max(axis=(1, 2))
+    return geometry.transforms(rotations, matrices[:, :, 3]), off
 
 
 def from_quaternions(rows: np.ndarray) -> tuple[Poses, Vector]:
     """The poses of rows (n, 7) x y z qx qy qz qw, and the difference of each quaternion's length from 1."""
-    norms, poses = np.linalg.norm(rows[:, 3:], axis=1), np.tile(np.eye(4), (len(rows), 1, 1))
+    norms = np.linalg.norm(rows[:, 3:], axis=1)
     quaternions = np.where(norms[:, None] > 0, rows[:, 3:], [0.0, 0.0, 0.0, 1.0])  # zeros are then rejected
-    poses[:, :3, :3] = ScipyRotation.from_quat(quaternions).as_matrix()
-    poses[:, :3, 3] = rows[:, :3]
+    poses = geometry.transforms(ScipyRotation.from_quat(quaternions).as_matrix(), rows[:, :3])
     return poses, np.abs(norms - 1.0)

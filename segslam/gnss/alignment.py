@@ -150,8 +150,7 @@ def linearised(matched: Matched, T_enu_map: Transform, arm_m: Vector) -> tuple[P
     """
     T_enu_lidar = T_enu_map @ matched.T_map_lidar
     estimated = antennas(T_enu_lidar, arm_m)
-    T_antenna_map = np.tile(np.eye(4), (len(estimated), 1, 1))  # with the axes of the local frame
-    T_antenna_map[:, :3, 3] = T_enu_map[:3, 3] - estimated
+    T_antenna_map = geometry.transforms(np.eye(3), T_enu_map[:3, 3] - estimated)  # with the axes of the local frame
     velocity = matched.velocity @ T_enu_map[:3, :3].T
     columns = np.dstack([adjoints(T_antenna_map)[:, 3:], velocity, T_enu_lidar[:, :3, :2]])
     columns[~np.isfinite(matched.enu_m)] = 0.0

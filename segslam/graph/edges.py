@@ -90,10 +90,7 @@ def values_of(T_world: Iterable[Transform], keys: Iterable[int] | None = None) -
 def poses_by_id(values: gtsam.Values) -> Transforms:
     """All poses, sorted by key."""
     rows = np.asarray(gtsam.utilities.extractPose3(values)).reshape(-1, 12)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
-    poses[:, :3, 3] = rows[:, 9:]
-    return poses
+    return geometry.transforms(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:])
 
 
 def chained(odometry: Sequence[Edge]) -> Transforms:

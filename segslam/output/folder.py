@@ -58,7 +58,7 @@ def new_folder(folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise SegslamError(f"{folder}: cannot be written ({error.strerror}); give another with --out") from error
+        raise not_writable(folder, error) from error
     return folder
 
 
@@ -68,7 +68,12 @@ def check_new(folder: Path) -> None:
         if folder.exists() and any(folder.iterdir()):
             raise SegslamError(f"{folder}: not empty; give another folder with --out, or replace a run: --overwrite")
     except OSError as error:
-        raise SegslamError(f"{folder}: cannot be written ({error.strerror}); give another with --out") from error
+        raise not_writable(folder, error) from error
+
+
+def not_writable(folder: Path, error: OSError) -> SegslamError:
+    """The exception for a new folder that cannot be written."""
+    return SegslamError(f"{folder}: cannot be written ({error.strerror}); give another with --out")
 
 
 def write_poses(

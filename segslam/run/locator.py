@@ -1,6 +1,6 @@
 """Localisation of single scans in a finished run, without initial guess."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -14,10 +14,7 @@ from segslam.core.points import within_range
 from segslam.core.threads import at_once
 from segslam.core.types import (
     Alignment,
-    CloudOf,
     Found,
-    Information,
-    Keyframe,
     Labels,
     Points,
     Rejected,
@@ -29,9 +26,8 @@ from segslam.core.types import (
 from segslam.graph import PoseGraph
 from segslam.keyframes import Submaps, downsample_keyframe
 from segslam.labels import geometric_labels
-from segslam.output.finished import read_run
-from segslam.output.log import read_log
 from segslam.registration.prepared import PreparedScan, prepare_scan
+from segslam.run.sessions.recorded import Session, read_session
 from segslam.slam.recognition import MAX_PLACES, recognise
 
 NUM_PREPARED = 256
@@ -66,36 +62,22 @@ class Located(Found):
 class Locator:
     """Locates scans among the keyframes of a finished run, which is not changed."""
 
-    def __init__(
-        self,
-        keyframes: list[Keyframe],
-        clouds: CloudOf,
-        informations: Sequence[Information | None],
-        T_world_keyframe: dict[int, Transform],
-        *,
-        config: Config,
-    ) -> None:
-        """`keyframes`: by id, with or without points; `clouds` provides the points. Missing signatures are computed.
-
-        `informations`: as `SlamResult.keyframe_informations`.
-        """
-        self.config = config
-        self.T_world_keyframe = T_world_keyframe
-        self.submaps = submaps_of(keyframes, clouds, informations, config)
+    def __init__(self, session: Session) -> None:
+        """`session`: the run. Signatures of its keyframes that it does not have are computed."""
+        self.session = session
+        self.config = session.run.config
+        self.submaps = submaps_of(session, self.config)
         self.prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
         """A keyframe by its id, prepared for alignment."""
-        self.signatures = [self.submaps.signature(keyframe.id, keyframe.place) for keyframe in keyframes]
+        self.signatures = [self.submaps.signature(keyframe.id, keyframe.place) for keyframe in session.keyframes]
         self.places = Places()
-        for keyframe, signature in zip(keyframes, self.signatures, strict=True):
-            self.places.add(keyframe.id, signature)
+        for keyframe_id, signature in enumerate(self.signatures):
+            self.places.add(keyframe_id, signature)
 
     @classmethod
     def from_run(cls, folder: str | Path) -> "Locator":
         """The locator of a run folder. Raises SegslamError, naming the file, if it is damaged or did not finish."""
-        run = read_run(folder)
-        keyframes, clouds = read_log(run.folder).keyframes()
-        informations = run.result.keyframe_informations()
-        return cls(keyframes, clouds, informations, run.result.estimate.T_world_keyframe, config=run.config)
+        return cls(read_session(Path(folder)))
 
     def locate(
         self, points: ArrayLike, labels: Labels | None = None, *, max_places: int = MAX_PLACES
@@ -119,9 +101,8 @@ class Locator:
         scan, (own, candidates) = at_once(
             lambda: prepare_scan(kept, kept_labels, config=config), lambda: self._candidates(kept, kept_labels)
         )
-        recognised = partial(
-            recognise, scan, places=self.prepared, T_world_place=self.T_world_keyframe.__getitem__, config=config
-        )
+        T_world_place = self.session.T_world_keyframe.__getitem__
+        recognised = partial(recognise, scan, places=self.prepared, T_world_place=T_world_place, config=config)
         found = recognised(candidates, max_places=min(max_places, NUM_FIRST))
         if isinstance(found, Rejected) and found.reason != RejectReason.AMBIGUOUS and max_places > NUM_FIRST:
             around = signatures_around(kept, kept_labels)
@@ -139,13 +120,12 @@ class Locator:
         return own, candidates
 
 
-def submaps_of(
-    keyframes: list[Keyframe], clouds: CloudOf, informations: Sequence[Information | None], config: Config
-) -> Submaps:
-    """The submaps of a drive; sparse keyframes are merged with their neighbours. Arguments as for `Locator`."""
+def submaps_of(session: Session, config: Config) -> Submaps:
+    """The submaps of a run by these settings; sparse keyframes are merged with their neighbours."""
     graph = PoseGraph(config.graph)
-    submaps = Submaps(config, clouds, geometric_labels, lambda: graph.motion_variance)
-    for keyframe, information in zip(keyframes, informations, strict=True):
+    submaps = Submaps(config, session.cloud_of, geometric_labels, lambda: graph.motion_variance)
+    informations = session.run.result.keyframe_informations()
+    for keyframe, information in zip(session.keyframes, informations, strict=True):
         graph.add_keyframe(keyframe.id, keyframe.T_odom_keyframe, keyframe.travel_m, information=information)
         submaps.add(keyframe.T_odom_keyframe, labelled_by_shape=bool(keyframe.labelled_by_shape))
     return submaps

@@ -5,7 +5,7 @@ import math
 import shlex
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import chain, pairwise
 from pathlib import Path
@@ -203,13 +203,11 @@ class Run:
             if self._unreported:
                 why = f"none of {len(self._unreported)} scans could be used; the first: {self._unreported[0]}"
             raise SegslamError(f"{self._dataset}: {why}")
-        started = perf_counter()
-        result = self._slam.finish(search_s=search_s, progress=progress)
-        self._note_ms("finish", perf_counter() - started)
+        with self._timed("finish"):
+            result = self._slam.finish(search_s=search_s, progress=progress)
         if result.adjusted is None:
-            started = perf_counter()
-            figures = self._vertical_angle(result)
-            self._note_ms("calibrate", perf_counter() - started)
+            with self._timed("calibrate"):
+                figures = self._vertical_angle(result)
         else:
             figures = result.adjusted.record.figures()
             self._note_ms("adjust", result.adjusted.record.seconds)
@@ -331,12 +329,11 @@ class Run:
 
     def _scans(self, dataset: Dataset) -> Iterator[Scan | BadScan]:
         for row in range(self._next_row, len(dataset)):
-            started = perf_counter()
-            try:
-                scan: Scan | BadScan = dataset[row]
-            except BadScan as error:
-                scan = error
-            self._note_ms("read", perf_counter() - started)
+            with self._timed("read"):
+                try:
+                    scan: Scan | BadScan = dataset[row]
+                except BadScan as error:
+                    scan = error
             yield scan
 
     def _track(self, scans: tuple[Scan | BadScan, Scan | BadScan | None]) -> Tracked | BadScan:
@@ -349,16 +346,15 @@ class Run:
             return error
 
     def _logged(self, step: Step) -> Step:
-        started = perf_counter()
-        self._log.write(step)
-        self.num_steps += 1
-        if self.num_steps == 1:
-            settle(self.folder)
-        if self.num_steps % TRIM_EVERY == 0:
-            give_back()  # or gaps of freed memory add up over a drive
-        while self._unreported:
-            self._report(self._unreported.pop(0))
-        self._note_ms("log", perf_counter() - started)
+        with self._timed("log"):
+            self._log.write(step)
+            self.num_steps += 1
+            if self.num_steps == 1:
+                settle(self.folder)
+            if self.num_steps % TRIM_EVERY == 0:
+                give_back()  # or gaps of freed memory add up over a drive
+            while self._unreported:
+                self._report(self._unreported.pop(0))
         for stage, seconds in step.stage_seconds.items():
             self._note_ms(stage, seconds)
         return step
@@ -369,6 +365,13 @@ class Run:
             self._log.warn(f"{bad}; skipped")
         else:
             self._unreported.append(bad)
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        """Context manager that notes the time within it."""
+        started = perf_counter()
+        yield
+        self._note_ms(stage, perf_counter() - started)
 
     def _note_ms(self, stage: str, seconds: float) -> None:
         self._stage_ms[stage].append(1000 * seconds)

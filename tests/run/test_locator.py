@@ -17,6 +17,8 @@ from segslam.core.types import Rejected, SegslamError, Step
 from segslam.odometry.sweep import GivenOdometry
 from segslam.output.log import read_log, reader
 from segslam.run.locator import Locator, submaps_of
+from segslam.run.sessions.recorded import read_session
+from segslam.slam.slam_result import SlamResult
 
 NUM_MAPPED = 50
 """A round of the drive; the scans after it see it again."""
@@ -180,10 +182,11 @@ def test_a_folder_that_is_no_run_is_refused_by_name(tmp_path: Path, capsys: pyte
     assert "nothing: no such file or folder" in capsys.readouterr().err
 
 
-def test_neighbours_whose_motion_is_unsure_are_not_merged(run: Path) -> None:
+def test_neighbours_whose_motion_is_unsure_are_not_merged(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As while the run was mapped: the information of each motion is in its log."""
-    keyframes, clouds = read_log(run).keyframes()
+    session = read_session(run)
     informations = [None, None, 1e-2 * np.eye(6), None, None, None]
-    submaps = submaps_of(keyframes[:6], clouds, informations, load_config(None, []))
+    monkeypatch.setattr(SlamResult, "keyframe_informations", lambda result: informations)
+    submaps = submaps_of(replace(session, keyframes=session.keyframes[:6]), load_config(None, []))
     assert set(submaps._neighbours(1, 5)) == {0}
     assert 1 not in set(submaps._neighbours(2, 5))

@@ -2,8 +2,10 @@
 
 import argparse
 import json
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ import numpy as np
 from segslam.bench.experiments.provenance import commit, machine
 from segslam.cli import main
 from segslam.core import geometry
-from segslam.core.evaluation import PoseError
+from segslam.core.evaluation import SUCCESS_DEG, SUCCESS_M
 from segslam.core.types import Alignment, Rejected, Transform
 
 RIGHT = 0.5, 2.0
@@ -21,6 +23,28 @@ RIGHT = 0.5, 2.0
 
 Row = dict[str, Any]
 """A line of a table."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseError:
+    """Error of one pose."""
+
+    translation_m: float
+    rotation_deg: float
+
+    @classmethod
+    def of(cls, T_error: Transform) -> "PoseError":
+        """Length and angle of a transform that is the identity where there is no error."""
+        return cls(geometry.distance(T_error), math.degrees(geometry.angle(T_error)))
+
+    def within(self, translation_m: float, rotation_deg: float) -> bool:
+        """Whether both errors are below these."""
+        return self.translation_m < translation_m and self.rotation_deg < rotation_deg
+
+    @property
+    def success(self) -> bool:
+        """By the rule of the Segregator paper."""
+        return self.within(SUCCESS_M, SUCCESS_DEG)
 
 
 def parser(doc: str | None, name: str) -> argparse.ArgumentParser:

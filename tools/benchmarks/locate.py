@@ -16,13 +16,13 @@ from time import perf_counter, process_time
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.evaluation import PoseError
 from segslam.core.types import Rejected
 from segslam.labels.label_files import computed
 from segslam.output.finished import read_run
 from segslam.run.locator import Locator
 from segslam.scans import open_dataset
 from tools.benchmarks import common
+from tools.benchmarks.common import PoseError
 
 WITHIN_M = 10.0
 

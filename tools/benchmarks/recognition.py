@@ -16,11 +16,11 @@ import numpy as np
 from segslam.candidates import Places, signature_of, signatures_around
 from segslam.core import geometry
 from segslam.core.config import load_config
-from segslam.core.evaluation import PoseError
 from segslam.core.trajectory import travelled_m
 from segslam.core.types import Rejected
 from segslam.slam.recognition import MAX_PLACES, recognise
 from tools.benchmarks import common
+from tools.benchmarks.common import PoseError
 from tools.benchmarks.submaps import Submaps
 
 NEAR_M = 10.0

@@ -26,12 +26,7 @@ PAIRS_AHEAD = 8
 
 
 def run(
-    job: Job,
-    trials: Sequence[Trial],
-    *,
-    workers: int = 1,
-    scheduler: str | None = None,
-    folder: Path | None = None,
+    job: Job, trials: Sequence[Trial], *, workers: int = 1, scheduler: str | None = None, folder: Path | None = None
 ) -> Iterator[list[Row]]:
     """Yields the rows of each trial when it is finished, starting with those already in the folder.
 
@@ -40,7 +35,7 @@ def run(
     folder continues where it stopped; raises SegslamError if the folder contains another benchmark.
     """
     done = _rows_before(folder, job, trials) if folder else []
-    tried = grouped(done, lambda row: row.key[:3])
+    tried = grouped(done, lambda row: row.trial_key)
     left = [trial for trial in trials if trial.key not in tried]
     if folder:
         write_rows(folder / ROWS_FILE, done)
@@ -54,7 +49,7 @@ def run(
 def in_order(rows: Sequence[Row], job: Job, trials: Sequence[Trial]) -> list[Row]:
     """The rows in the order of a single process, whatever the order in which they were finished."""
     place = {trial.key: number for number, trial in enumerate(trials)}
-    return sorted(rows, key=lambda row: (place[row.key[:3]], job.methods.index(row.method)))
+    return sorted(rows, key=lambda row: (place[row.trial_key], job.methods.index(row.method)))
 
 
 def _work(job: Job, trials: Sequence[Trial], workers: int, scheduler: str | None) -> Iterator[list[Row]]:
@@ -126,7 +121,7 @@ def _rows_before(folder: Path, job: Job, trials: Sequence[Trial]) -> list[Row]:
         if before.get(key) != identity[key]:
             raise SegslamError(f"{folder}: contains a benchmark with other {key}; choose another --out, or delete it")
     rows = read_rows(folder / ROWS_FILE) if (folder / ROWS_FILE).exists() else []
-    trials_before = grouped([row for row in rows if row.reason != LOST_WORKER], lambda row: row.key[:3]).values()
+    trials_before = grouped([row for row in rows if row.reason != LOST_WORKER], lambda row: row.trial_key).values()
     return [row for some in trials_before if {one.method for one in some} == set(job.methods) for row in some]
 
 

@@ -1,6 +1,7 @@
 """Data, methods and settings of a benchmark, and its two units of work: prepare a scan, register a pair."""
 
 import logging
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -11,7 +12,6 @@ from segslam.bench.experiments.pairs import ScanVariant, Trial
 from segslam.bench.experiments.rows import Row
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.evaluation import PoseError
 from segslam.core.threads import Stopwatch
 from segslam.core.types import BadScan, Points, Rejected
 from segslam.labels import geometric_labels
@@ -103,11 +103,11 @@ def _times(aligned: Cost, prepared: list[Cost], labelled: list[Cost], watch: Sto
 
 
 def _found(estimate: Estimate, trial: Trial) -> dict[str, object]:
-    error = PoseError.of(estimate.T_target_source @ geometry.inverse(trial.T_target_source))
+    T_error = estimate.T_target_source @ geometry.inverse(trial.T_target_source)
     return {
         "accepted": True,
-        "error_m": error.translation_m,
-        "error_deg": error.rotation_deg,
+        "error_m": geometry.distance(T_error),
+        "error_deg": math.degrees(geometry.angle(T_error)),
         "num_correspondences": estimate.num_correspondences,
         "num_edges": estimate.num_edges,
         "num_inliers": estimate.num_inliers,

@@ -1,15 +1,15 @@
 """Values of the Segregator paper (Yin et al., ICRA 2023), for comparison with measurements on the same lists."""
 
 from collections.abc import Sequence
+from itertools import chain, product
 from typing import Any
 
 from segslam.bench.experiments.pairs import PairList
 
-LISTS = {"easy": "3to5", "medium": "8to10", "hard": "10to15"}
-"""Names of the lists in their file names, from the distance of the scans (m)."""
-SEQUENCES = ("00", "05", "06", "07", "08")
-NUM_PAIRS = ((8503, 7527, 21267), (5155, 5243, 11600), (1128, 1113, 2825), (1311, 1169, 2877), (2064, 2750, 9457))
-"""Number of pairs in the easy, medium and hard list of each sequence."""
+NAMES = [f"kitti{one}_{band}" for one, band in product(("00", "05", "06", "07", "08"), ("3to5", "8to10", "10to15"))]
+"""The easy, medium and hard list of each sequence, by the distance of the scans (m)."""
+COUNTS = ((8503, 7527, 21267), (5155, 5243, 11600), (1128, 1113, 2825), (1311, 1169, 2877), (2064, 2750, 9457))
+NUM_PAIRS = dict(zip(NAMES, chain.from_iterable(COUNTS), strict=True))
 SUCCESS_PERCENT = {
     "vgicp": ((95.6, 34.1, 14.9), (82.6, 34.6, 25.3), (94.6, 66.7, 35.1), (80.0, 36.5, 0.8), (0.24, 0.0, 4.9)),
     "teaser": ((97.0, 65.4, 41.1), (96.4, 73.4, 48.0), (99.8, 94.3, 83.2), (91.1, 49.2, 30.7), (96.6, 74.8, 49.5)),
@@ -35,11 +35,9 @@ DETERIORATION = {10: (0.09, 0.20), 30: (0.04, 0.22), 50: (0.31, 0.21), 70: (0.06
 
 def success_percent(method: str, pairs: str, num_pairs: int) -> float | None:
     """The paper's value for a list of this name (kittiSS_LOtoHI) and number of pairs; None if the paper has none."""
-    for sequence, counts, row in zip(SEQUENCES, NUM_PAIRS, SUCCESS_PERCENT.get(method, ()), strict=False):
-        for band, count, value in zip(LISTS.values(), counts, row, strict=True):
-            if (f"kitti{sequence}_{band}", count) == (pairs, num_pairs):
-                return value
-    return None
+    if method not in SUCCESS_PERCENT or NUM_PAIRS.get(pairs) != num_pairs:
+        return None
+    return dict(zip(NAMES, chain.from_iterable(SUCCESS_PERCENT[method]), strict=True))[pairs]
 
 
 def with_paper_values(
@@ -51,8 +49,7 @@ def with_paper_values(
     errors if the pair is scans 0 and 10 of 05. The comparison also applies to lists that were sampled.
     """
     whole = {one.name: one.num_whole for one in lists}
-    numbers = zip(LISTS.values(), NUM_PAIRS[SEQUENCES.index(TIMING_SEQUENCE)], strict=True)
-    all_lists = {f"kitti{TIMING_SEQUENCE}_{band}": number for band, number in numbers}
+    all_lists = {name: number for name, number in NUM_PAIRS.items() if name.startswith(f"kitti{TIMING_SEQUENCE}")}
     is_paper_pair = len(lists) == 1 and lists[0].pairs.tolist() == [[0, 10]]
     timing = TIMING if (experiment, sequence.zfill(2), whole) == ("timing", TIMING_SEQUENCE, all_lists) else {}
     reduced = is_paper_pair and (experiment, sequence.zfill(2)) == ("deterioration", "05")

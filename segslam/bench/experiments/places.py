@@ -64,7 +64,7 @@ def parse_range(text: str, option: str, num_places: int) -> range:
         rows = range(int(first or 0), int(end or num_places))
     except ValueError:
         rows = range(0)
-    if not colon or not rows or not 0 <= rows.start < rows.stop <= num_places:
+    if not colon or not 0 <= rows.start < rows.stop <= num_places:
         raise SegslamError(f"{option} {text}: give rows A:B, B excluded, of the {num_places} places")
     return rows
 
@@ -87,15 +87,15 @@ def measure(
     query_s: list[float] = []
     at = places.T_world_lidar[:, :, 3]
     database_at = at[list(database)]
-    rng = None if turned_seed is None else np.random.default_rng(turned_seed)
-    yaws = np.zeros(len(queries)) if rng is None else rng.uniform(0.0, math.tau, len(queries))
-    yaw_of = dict(zip(queries, yaws.tolist(), strict=True))
-    steps = [(row, False) for row in database] + [(row, True) for row in queries]
-    for row, is_query in progress(steps, len(steps), "bench places"):
-        if not is_query:
+    yaws = np.zeros(len(queries))
+    if turned_seed is not None:
+        yaws = np.random.default_rng(turned_seed).uniform(0.0, math.tau, len(queries))
+    steps = [*((row, None) for row in database), *zip(queries, yaws.tolist(), strict=True)]
+    for row, yaw_rad in progress(steps, len(steps), "bench places"):
+        if yaw_rad is None:
             index.add(row, signature_of_standing(places.points(row)))
         elif np.linalg.norm(database_at - at[row], axis=1).min() <= HIT_M:
-            signature = signature_of_standing(places.points(row, yaw_rad=yaw_of[row]))
+            signature = signature_of_standing(places.points(row, yaw_rad=yaw_rad))
             started = perf_counter()
             listed = index.shortlist(signature, most=SHORTLIST)
             query_s.append(perf_counter() - started)

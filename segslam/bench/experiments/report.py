@@ -16,14 +16,7 @@ from segslam.core.config import Config
 from segslam.core.whole_files import write_whole
 from segslam.output.report import figures
 from segslam.output.report.figures import plain_powers, svg
-from segslam.output.report.page import (
-    document,
-    picture_section,
-    section,
-    settings_not_default,
-    settings_tables,
-    table,
-)
+from segslam.output.report.page import document, picture_section, section, settings_not_default, settings_tables, table
 
 COLORS = ["#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#8C564B", "#7F7F7F", "#1F3A93", "#BCBD22"]
 """A colour for each method; first those of Okabe and Ito."""

@@ -1,7 +1,6 @@
 """One row per registration, written to a CSV file at once and read to resume a benchmark; statistics of rows."""
 
 import csv
-import math
 from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TextIO
@@ -10,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from segslam.bench.experiments.pairs import ScanVariant
-from segslam.core.evaluation import PoseError
+from segslam.core.evaluation import SUCCESS_DEG, SUCCESS_M
 from segslam.core.types import SegslamError, Transform
 from segslam.core.whole_files import cannot_write, whole_file
 
@@ -58,21 +57,16 @@ class Row(BaseModel):
     @property
     def success(self) -> bool:
         """True for an error below 2 m and 5 degrees, the paper's criterion."""
-        return self.accepted and self.error.success
-
-    @property
-    def error(self) -> PoseError:
-        """Infinite where no pose was given."""
         if self.error_m is None or self.error_deg is None:
-            return PoseError(math.inf, math.inf)
-        return PoseError(self.error_m, self.error_deg)
+            return False
+        return self.accepted and self.error_m < SUCCESS_M and self.error_deg < SUCCESS_DEG
 
     @property
-    def key(self) -> tuple[str, ScanVariant, ScanVariant, str]:
-        """Identifies the trial and the method."""
+    def trial_key(self) -> tuple[str, ScanVariant, ScanVariant]:
+        """The key of the row's `Trial`."""
         source = ScanVariant(self.source, self.source_yaw_deg, self.source_lost, self.draw if self.source_lost else 0)
         target = ScanVariant(self.target, 0.0, self.target_lost, self.draw if self.target_lost else 0)
-        return self.pairs, source, target, self.method
+        return self.pairs, source, target
 
     @property
     def estimate(self) -> Transform | None:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from segslam.bench.simulation.mesh import Mesh, box, extruded, frustum, join_meshes, leaves, mesh, placed, stem
+from segslam.core import geometry
 from segslam.core.types import Label, Vector
 
 STOREYS_M = (0.0, 0.9, 2.2, 3.6, 4.9, 6.4, 7.7)  # heights of sills and lintels, alternating
@@ -183,6 +184,5 @@ def hedge(rng: np.random.Generator, length_m: float, width_m: float, height_m: f
 
 def _ball(rng: np.random.Generator, count: int, *, hollow: float) -> np.ndarray:
     """Points within the unit ball, at least `hollow` from its centre."""
-    directions = rng.normal(size=(count, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = geometry.unit_rows(rng.normal(size=(count, 3)))
     return directions * (rng.uniform(hollow**3, 1.0, size=(count, 1)) ** (1 / 3))

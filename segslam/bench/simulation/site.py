@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from segslam.bench.simulation.mesh import Mesh, placed
 from segslam.bench.simulation.terrain import CELL_M, Terrain, middle_of_street
+from segslam.core import geometry
 from segslam.core.trajectory import Poses
 from segslam.core.types import Label, Points, Vector
 
@@ -90,8 +91,7 @@ class Spot:
 def frontages(path: np.ndarray) -> tuple[Frontage, Frontage]:
     """Left and right side of the streets along a path (n, 3) with points 1 m apart; each street occurs once."""
     middle = middle_of_street(path)
-    normal = middle - path[:, :2]
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    normal = geometry.unit_rows(middle - path[:, :2])
     pairs = cKDTree(middle).query_pairs(STREET_GAP_M, output_type="ndarray").reshape(-1, 2)
     again = pairs[pairs[:, 1] - pairs[:, 0] > 4 * STREET_GAP_M, 1]
     first = np.setdiff1d(np.arange(len(middle)), again)

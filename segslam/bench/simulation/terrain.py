@@ -7,6 +7,7 @@ from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 
 from segslam.bench.simulation.mesh import Mesh, mesh
+from segslam.core import geometry
 from segslam.core.types import Label, Labels, Vector
 
 CELL_M = 0.5  # chosen: width of a kerb
@@ -51,8 +52,7 @@ class Terrain:
 
 def middle_of_street(path: np.ndarray) -> np.ndarray:
     """(n, 2) centre line of the street beside a path (n, 2 or 3) with points at most 1 m apart."""
-    tangent = np.gradient(path[:, :2], axis=0)
-    tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
+    tangent = geometry.unit_rows(np.gradient(path[:, :2], axis=0))
     return path[:, :2] + LANE_M * np.column_stack([-tangent[:, 1], tangent[:, 0]])
 
 

@@ -120,8 +120,7 @@ def _seconds(path: np.ndarray) -> Vector:
 def _rounded(street: np.ndarray) -> np.ndarray:
     """The right lane of a closed street, with rounded corners."""
     smooth = gaussian_filter1d(street, TURN_M / STEP_M, axis=0, mode="wrap")
-    tangent = np.gradient(np.concatenate([smooth[-1:], smooth, smooth[:1]]), axis=0)[1:-1]
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    tangent = geometry.unit_rows(np.gradient(np.concatenate([smooth[-1:], smooth, smooth[:1]]), axis=0)[1:-1])
     return smooth + LANE_M * np.column_stack([tangent[:, 1], -tangent[:, 0]])
 
 
@@ -132,15 +131,10 @@ def _height_m(xy: np.ndarray) -> Vector:
 
 def _poses(xy: np.ndarray, forward: np.ndarray) -> Poses:
     """Poses on the hills, with x along the road."""
-    ahead = forward / np.linalg.norm(forward, axis=1, keepdims=True)
-    slope = _height_m(xy + ahead) - _height_m(xy)
-    x = np.column_stack([ahead, slope])
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    ahead = geometry.unit_rows(forward)
+    x = geometry.unit_rows(np.column_stack([ahead, _height_m(xy + ahead) - _height_m(xy)]))
     y = np.column_stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(x))])
-    poses = np.tile(np.eye(4), (len(x), 1, 1))
-    poses[:, :3, :3] = np.stack([x, y, np.cross(x, y)], axis=-1)
-    poses[:, :3, 3] = np.column_stack([xy, _height_m(xy)])
-    return poses
+    return geometry.transforms(np.stack([x, y, np.cross(x, y)], axis=-1), np.column_stack([xy, _height_m(xy)]))
 
 
 def level_world(T_world_lidar: Poses) -> Poses:
@@ -148,10 +142,8 @@ def level_world(T_world_lidar: Poses) -> Poses:
     up = T_world_lidar[:, :3, 2].mean(axis=0)
     up /= np.linalg.norm(up)
     turn = geometry.level(up)
-    poses = T_world_lidar.copy()
-    poses[:, :3, :3] = turn @ T_world_lidar[:, :3, :3]
-    poses[:, :3, 3] = (T_world_lidar[:, :3, 3] - T_world_lidar[0, :3, 3]) @ turn.T
-    return poses
+    from_start = T_world_lidar[:, :3, 3] - T_world_lidar[0, :3, 3]
+    return geometry.transforms(turn @ T_world_lidar[:, :3, :3], from_start @ turn.T)
 
 
 def level_revisits(T_world_lidar: Poses) -> Poses:
@@ -207,10 +199,7 @@ def _ties(path_xy: np.ndarray) -> csr_array:
 def _raised(T_world_lidar: Poses, heights: Vector, slope: Vector) -> Poses:
     """Each pose moved to its height and pitched about its left axis, so that the slope increases by `slope`."""
     forward = T_world_lidar[:, :3, 0]
-    left = np.cross([0.0, 0.0, 1.0], forward)
-    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    left = geometry.unit_rows(np.cross([0.0, 0.0, 1.0], forward))
     turns = ScipyRotation.from_rotvec(-np.arctan(slope)[:, None] * left).as_matrix()
-    poses = T_world_lidar.copy()
-    poses[:, :3, :3] = turns @ T_world_lidar[:, :3, :3]
-    poses[:, 2, 3] = heights
-    return poses
+    at = np.column_stack([T_world_lidar[:, :2, 3], heights])
+    return geometry.transforms(turns @ T_world_lidar[:, :3, :3], at)

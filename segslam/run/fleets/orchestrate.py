@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
+from segslam.core.threads import Stopwatch
 from segslam.core.types import SegslamError, WorkFailed
 from segslam.core.whole_files import expanded, write_whole
+from segslam.output.folder import not_writable
 from segslam.run.fleets import steps
 from segslam.run.fleets.drives import Drive, drives_of, read_drives
 from segslam.run.fleets.relations import Components
@@ -90,7 +91,7 @@ def _alone_in(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         lock = os.open(folder, os.O_RDONLY)
     except OSError as error:
-        raise _cannot_write(folder, error) from error
+        raise not_writable(folder, error) from error
     try:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -101,14 +102,10 @@ def _alone_in(folder: Path) -> Iterator[None]:
         try:
             steps.remove_unfinished(folder)
         except OSError as error:
-            raise _cannot_write(folder, error) from error
+            raise not_writable(folder, error) from error
         yield
     finally:
         os.close(lock)
-
-
-def _cannot_write(folder: Path, error: OSError) -> SegslamError:
-    return SegslamError(f"{folder}: cannot be written ({error.strerror}); give another with --out")
 
 
 class _Fleet:
@@ -116,7 +113,7 @@ class _Fleet:
 
     def __init__(self, folder: Path, run: Workers, shown: Progress, say: Callable[[str], object]) -> None:
         self._folder, self._run, self._shown, self._say = folder, run, shown, say
-        self._seconds: dict[str, float] = {}
+        self._watch = Stopwatch()
         self._reasons: dict[str, str] = {}
 
     def run(self, drives: Sequence[Drive], same_reference: bool) -> FleetResult:
@@ -132,7 +129,7 @@ class _Fleet:
             reason = self._reasons.get(drive.name)
             state = {"state": "failed" if reason else "mapped", "component": where.get(drive.name)}
             states[drive.name] = state | ({"reason": reason} if reason else {})
-        result = FleetResult(self._folder, states, tuple(made), self._seconds)
+        result = FleetResult(self._folder, states, tuple(made), self._watch.seconds)
         _write(result)
         failed = [one["reason"] for one in made if "reason" in one]
         if failed:
@@ -141,10 +138,9 @@ class _Fleet:
 
     def _all(self, name: str, function: Callable[..., Any], tasks: Sequence[tuple[Any, ...]]) -> list[Outcome]:
         """The outcomes of a step, in the order of its tasks."""
-        started = perf_counter()
-        done = self._run(function, tasks)
-        outcomes: dict[int, Outcome] = dict(self._shown(done, len(tasks), name) if tasks else ())
-        self._seconds[name] = self._seconds.get(name, 0.0) + perf_counter() - started
+        with self._watch(name):
+            done = self._run(function, tasks)
+            outcomes: dict[int, Outcome] = dict(self._shown(done, len(tasks), name) if tasks else ())
         return [outcomes[number] for number in range(len(tasks))]
 
     def _done(self, step: str, function: Callable[..., Mapped], drives: Sequence[Drive | Mapped]) -> list[Mapped]:

@@ -158,9 +158,8 @@ def relate(fleet: Path, later: Mapped, earlier: Mapped, queries: Sequence[int]) 
     """The pose of a drive in an earlier one, from its keyframes that look like places there."""
     file = fleet / PAIRS / f"{later.name} at {earlier.name}-{key_of(later.key, earlier.key, queries)}.json"
     if not file.exists():
-        session, known = (read_session(one.folder(fleet)) for one in (later, earlier))
-        locator = _locator(fleet, earlier)
-        relation = find_session(session, known, locator, config=known.run.config, likely=queries)
+        session, locator = read_session(later.folder(fleet)), _locator(fleet, earlier)
+        relation = find_session(session, locator, config=locator.config, likely=queries)
         _replace(file, partial(write_kept, kind=Relation, value=relation))
     return read_kept(file, Relation)
 

@@ -90,12 +90,7 @@ class OdometryEnded(Exception):
 
 
 def serve(
-    pipe: Connection,
-    source: Source,
-    configs: Mapping[Preset, Config],
-    idle_s: float | None,
-    past: Past,
-    tally: Tally,
+    pipe: Connection, source: Source, configs: Mapping[Preset, Config], idle_s: float | None, past: Past, tally: Tally
 ) -> None:
     """Process scans until the source ends, `idle_s` pass without a scan, or the main process sends or closes.
 
@@ -199,12 +194,7 @@ def _continued(tracker: Tracker, past: Past, waiting: Waiting) -> Tracker:
 
 
 def _place_all(
-    track: Track,
-    source: Source,
-    waiting: Waiting,
-    to_send: "SimpleQueue[Any]",
-    idle_s: float | None,
-    past: Past,
+    track: Track, source: Source, waiting: Waiting, to_send: "SimpleQueue[Any]", idle_s: float | None, past: Past
 ) -> bool:
     """Process each scan. Returns True if it ended because no scan came for `idle_s`."""
     last_ns = past.steps[-1].stamp_ns if past.steps else None

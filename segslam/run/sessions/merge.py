@@ -134,11 +134,11 @@ def plan(
 
     @cache
     def locator(number: int) -> Locator:
-        return Locator.from_run(sessions[number].run.folder)
+        return Locator(sessions[number])
 
     @cache
     def related(later: int, earlier: int) -> Relation:
-        return find_session(sessions[later], sessions[earlier], locator(earlier), config=config, progress=progress)
+        return find_session(sessions[later], locator(earlier), config=config, progress=progress)
 
     order, poses = [0], list[SessionPose | None]([None])
     while waiting := [number for number in range(len(sessions)) if number not in order]:

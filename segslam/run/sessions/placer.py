@@ -47,8 +47,7 @@ class Placer:
     def __init__(self, config: Config, locator: Locator, graph: AnchoredGraph, submaps: Submaps) -> None:
         """`submaps` provides the keyframes of the drive, which are in the graph."""
         self._config, self._locator, self._graph, self._submaps = config, locator, graph, submaps
-        ids = sorted(locator.T_world_keyframe)
-        self._T_world_map = np.array([locator.T_world_keyframe[number] for number in ids])
+        self._T_world_map = locator.session.T_world_keyframe
         self._map_seen: Callable[[int], Observed] = lru_cache(NUM_PREPARED)(partial(self._seen, locator.submaps))
         self._last: Placement | None = None
         """The newest placed keyframe."""
@@ -94,12 +93,7 @@ class Placer:
         return outcome
 
     def _registered(
-        self,
-        keyframe_id: int,
-        own: Observed,
-        target_id: int,
-        T_world_predicted: Transform,
-        watch: Stopwatch,
+        self, keyframe_id: int, own: Observed, target_id: int, T_world_predicted: Transform, watch: Stopwatch
     ) -> Placement | Rejected:
         with watch("prepare"):
             target = self._map_seen(target_id)

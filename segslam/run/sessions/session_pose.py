@@ -46,14 +46,13 @@ class Relation:
 
 def find_session(
     session: Session,
-    earlier: Session,
     locator: Locator,
     *,
     config: Config,
     likely: Sequence[int] | None = None,
     progress: Progress = no_progress,
 ) -> Relation:
-    """The pose of a session in an earlier one.
+    """The pose of a session in an earlier one, that of the locator.
 
     Keyframes are searched until `MIN_FOUND` consistent ones, `MIN_SPREAD_M` apart, are found: at most `NUM_QUERIES`,
     spread over the session; sparse ones together with their neighbours. `likely`: these keyframes are searched instead,
@@ -61,9 +60,8 @@ def find_session(
     a place of the earlier session, and no other place is tried.
     """
     count = len(session.travel_m)
-    informations = session.run.result.keyframe_informations()
-    submaps = submaps_of(session.keyframes, session.cloud_of, informations, config)
-    graph, first_id = _both(earlier, session, config)
+    submaps = submaps_of(session, config)
+    graph, first_id = _both(locator.session, session, config)
     queue = deque(_spread(count) if likely is None else likely)
     found: list[LoopClosure] = []
     kept: list[LoopClosure] = []

@@ -15,12 +15,11 @@ import numpy as np
 from segslam.bench.experiments.pairs import Trial
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.evaluation import PoseError
 from segslam.core.types import Alignment, Registration, Rejected, Transform
 from segslam.registration import refinement, segregator
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import register_prepared
-from tools.benchmarks.common import RIGHT, Row, draw_pairs
+from tools.benchmarks.common import RIGHT, PoseError, Row, draw_pairs
 from tools.benchmarks.registration.scans import BANDS_M, Labelled, SimulatedPlace, by_shape
 
 NEGATIVE_M = 100.0

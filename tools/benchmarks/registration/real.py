@@ -18,8 +18,8 @@ from segslam.core.config import Config
 from segslam.core.types import Alignment
 from segslam.verification import register_prepared
 from tools.benchmarks import real_pairs
-from tools.benchmarks.common import Row
-from tools.benchmarks.registration.attempts import error, percent, preparer
+from tools.benchmarks.common import PoseError, Row
+from tools.benchmarks.registration.attempts import LOST, error, percent, preparer
 from tools.benchmarks.registration.scans import by_shape, courtyard_points, kitti_pose, real_indices, real_scan
 
 FAR_M = 20.0
@@ -51,7 +51,7 @@ def real(data: Path, config: Config, *, num_yaws: int) -> list[Row]:
 
 def _figures(some: Sequence[rows.Row], apart_m: float) -> Row:
     by_method = grouped(some, lambda row: row.method)
-    coarse, fine = ([row.error for row in by_method[name]] for name in (real_pairs.COARSE, real_pairs.REFINED))
+    coarse, fine = ([_error(row) for row in by_method[name]] for name in (real_pairs.COARSE, real_pairs.REFINED))
     bound = NEAR_BOUND if apart_m <= FAR_M else FAR_BOUND
     return {
         "apart_m": round(apart_m, 1),
@@ -63,6 +63,11 @@ def _figures(some: Sequence[rows.Row], apart_m: float) -> Row:
         "refined_worst_m": round(max(error.translation_m for error in fine), 3),
         "refined_worst_deg": round(max(error.rotation_deg for error in fine), 2),
     }
+
+
+def _error(row: rows.Row) -> PoseError:
+    """Infinite where no pose was given."""
+    return LOST if row.error_m is None or row.error_deg is None else PoseError(row.error_m, row.error_deg)
 
 
 def real_negatives(data: Path, config: Config, *, every: int) -> list[Row]:

@@ -23,9 +23,7 @@ SOURCE = "replayed.txt"
 def compare(
     runs: Annotated[list[Path], typer.Argument(help="Run folders, two or more.", metavar="RUN RUN...")],
     *,
-    plot: Annotated[
-        Path | None, typer.Option(help="Draw the trajectories and their errors to this file: .png, .svg or .pdf.")
-    ] = None,
+    plot: Annotated[Path | None, "Draw the trajectories and their errors to this file: .png, .svg or .pdf."] = None,
     tables: TableFiles,
     overwrite: OverwriteOption = False,
     terminal: Terminal,
@@ -64,9 +62,9 @@ def _names(runs: list[Path]) -> list[str]:
 
 
 def sweep(
-    run: Annotated[Path, typer.Argument(help="Run folder, or its log.mcap.")],
+    run: Annotated[Path, "Run folder, or its log.mcap."],
     *,
-    out: Annotated[Path, typer.Option(help="Folder for the replays; what is there already is not done again.")],
+    out: Annotated[Path, "Folder for the replays; what is there already is not done again."],
     settings: Annotated[
         list[str],
         typer.Option(

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from segslam.core.whole_files import write_whole
 
 SHORT = {
@@ -51,10 +49,8 @@ def with_meanings(columns: Sequence[Mapping[str, Any]], meanings: Mapping[str, s
 class TableFiles:
     """Options of commands with a table."""
 
-    csv: Annotated[Path | None, typer.Option(help="Write the table to this file, a row for each.")] = None
-    latex: Annotated[
-        Path | None, typer.Option(help="Write the table to this file as a LaTeX tabular, a row for each.")
-    ] = None
+    csv: Annotated[Path | None, "Write the table to this file, a row for each."] = None
+    latex: Annotated[Path | None, "Write the table to this file as a LaTeX tabular, a row for each."] = None
 
     def write(self, rows: Rows) -> None:
         """Write the files that are given: CSV has all numbers in full, LaTeX the columns for people."""

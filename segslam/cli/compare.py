@@ -37,8 +37,9 @@ def compare(
     names = _names(runs)
     check_free([plot, tables.csv, tables.latex], overwrite=overwrite)
     terminal.announce(f"compare: reading {len(runs)} runs")
-    from segslam.output.finished import FIGURES, read_metrics, read_run
+    from segslam.output.finished import read_metrics, read_run
     from segslam.output.report.comparison import check_picture, draw_runs
+    from segslam.output.words import FIGURES
 
     if plot is not None:
         check_picture(plot)

@@ -79,10 +79,10 @@ def evaluate(
     if how.rpe_distance is not None and not any("rpe_distance_m" in row for row in rows.values()):
         terminal.say(f"--rpe-distance {how.rpe_distance:g}: no drive is that long; the error over it is not given")
     tables.write(rows)
-    from segslam.output.accuracy import AFTER, MEANINGS
-    from segslam.output.finished import FIGURES
+    from segslam.output.accuracy import AFTER
+    from segslam.output.words import FIGURES, SCORES
 
-    meanings = {"ate_m": FIGURES["ate_m"]} | MEANINGS | FIGURES
+    meanings = {"ate_m": FIGURES["ate_m"]} | SCORES | FIGURES
     meanings = {key: words.replace(AFTER["se3"], AFTER[how.align]) for key, words in meanings.items()}
     terminal.table(figures, as_text(rows) if "drives" in figures else with_meanings([figures], meanings))
     if plot is not None and not terminal.json:

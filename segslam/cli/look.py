@@ -103,7 +103,7 @@ def _found_in(log: "RunLog") -> dict[str, Any]:
 
 def _lines(found: dict[str, Any]) -> str:
     """The content as text, for 80 columns."""
-    from segslam.output.finished import FIGURES
+    from segslam.output.words import FIGURES
 
     num_steps = counted(found["num_steps"], "scan")
     then = f"; continue with: segslam resume {shlex.quote(found['run'])}" if found["state"] == "interrupted" else ""

@@ -73,13 +73,7 @@ def convert(
     from segslam.output.conversion import convert as convert_file
 
     num_poses = convert_file(
-        source,
-        target,
-        source_format=source_format,
-        target_format=target_format,
-        times=times,
-        calib=calib,
-        to=to_frame,
+        source, target, source_format=source_format, target_format=target_format, times=times, calib=calib, to=to_frame
     )
     terminal.answer({"num_poses": num_poses, "file": str(target)}, f"{num_poses} poses in {target}")
 

@@ -68,9 +68,7 @@ def read_run(folder: str | Path) -> FinishedRun:
         dataset=log.run.get("dataset", ""),
         config=log.config,
         result=replace(
-            result,
-            from_map_m=read_localised(folder, len(result.trajectory)),
-            alone=read_alone(folder, result.odometry),
+            result, from_map_m=read_localised(folder, len(result.trajectory)), alone=read_alone(folder, result.odometry)
         ),
         reference=log.reference(),
         T_camera_lidar=log.T_camera_lidar,

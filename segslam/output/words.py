@@ -14,5 +14,9 @@ WORDS = _TEXTS["words"]
 """What the words of a report and of `loops.csv` mean, in the order of the pipeline."""
 REASONS = _TEXTS["reasons"]
 """`RejectReason` -> why the candidate was rejected, in the order of the pipeline."""
+COLUMNS = _TEXTS["columns"]
+"""Figures -> heads of the columns of a table for people."""
+CONDITIONS = _TEXTS["conditions"]
+"""Key in the log -> text in the report."""
 FILES = _TEXTS["files"]
 """Files of a run folder -> what they contain, in HTML."""

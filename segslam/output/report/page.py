@@ -10,18 +10,8 @@ from typing import Any
 from segslam.core.config import Config, changed_settings
 from segslam.core.types import Rejected
 from segslam.output.finished import COMPARED, FinishedRun, plain_name
-from segslam.output.words import FIGURES, FILES, REASONS, WORDS
+from segslam.output.words import CONDITIONS, FIGURES, FILES, REASONS, WORDS
 from segslam.slam.adjustment.vertical_angle import vertical_angle_advice
-
-CONDITIONS = {
-    "started": "started (UTC)",
-    "command": "command",
-    "segslam": "segslam",
-    "processor": "processor",
-    "platform": "system",
-    "python": "Python",
-}
-"""Key in the log -> text on the page."""
 
 
 def page(run: FinishedRun, plots: Mapping[str, str], *, top: str, gallery: str, about: Mapping[str, str]) -> str:

@@ -8,10 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from segslam.cli import completion
 from segslam.cli.checks import check_exists, check_free, check_own, check_run
 from segslam.cli.console import Terminal
-from segslam.cli.options import OverwriteOption
+from segslam.cli.options import OverwriteOption, set_option
 from segslam.cli.tables import TableFiles, as_text, with_meanings
 from segslam.core.errors import SegslamError, WorkFailed
 from segslam.core.interrupts import when_stopped
@@ -68,12 +67,7 @@ def sweep(
     out: Annotated[Path, "Folder for the replays; what is there already is not done again."],
     settings: Annotated[
         list[str],
-        typer.Option(
-            "--set",
-            metavar="SECTION.KEY=A,B,C",
-            autocompletion=completion.settings,
-            help="Values of a setting; of several settings, all combinations are replayed.",
-        ),
+        set_option("Values of a setting; of several settings, all combinations are replayed.", values="A,B,C"),
     ],
     workers: Annotated[int, typer.Option(min=1, help="Number of processes on this machine.")] = 1,
     scheduler: Annotated[

@@ -67,20 +67,19 @@ WithMapOption = Annotated[
 ]
 
 
+def set_option(
+    text: str, *, values: str = "VALUE", completed: Callable[[str], list[str]] = completion.settings
+) -> OptionInfo:
+    """An option `--set` with its help; `values`: what it shows behind the equals sign."""
+    return typer.Option("--set", metavar=f"SECTION.KEY={values}", autocompletion=completed, help=text)
+
+
 @dataclass(frozen=True)
 class Settings:
     """The settings of a command."""
 
     config: Annotated[Path | None, "YAML file with the settings that differ from the defaults."] = None
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="SECTION.KEY=VALUE",
-            autocompletion=completion.settings,
-            help="Change one setting: section.key=value; may be repeated.",
-        ),
-    ] = None
+    settings: Annotated[list[str] | None, set_option("Change one setting: section.key=value; may be repeated.")] = None
 
     def overrides(self) -> list[str]:
         """Changes of single settings, as for `load_config`."""

@@ -9,7 +9,7 @@ from segslam.cli.checks import check_own, make_folder
 from segslam.cli.completion import simulation_settings
 from segslam.cli.console import Terminal, how_to_go_on
 from segslam.cli.map import map_data
-from segslam.cli.options import GnssOptions, OverwriteOption, RunOptions, RunOutput
+from segslam.cli.options import GnssOptions, OverwriteOption, RunOptions, RunOutput, set_option
 from segslam.core.errors import SegslamError
 from segslam.core.interrupts import interrupts_wait, same_command_with, when_stopped
 
@@ -45,11 +45,8 @@ def simulate(
     reverse: Annotated[bool, "Drive the path in the opposite direction."] = False,
     settings: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="SECTION.KEY=VALUE",
-            autocompletion=simulation_settings,
-            help="Change a setting of the world or the sensor, for example world.cars=3.",
+        set_option(
+            "Change a setting of the world or the sensor, for example world.cars=3.", completed=simulation_settings
         ),
     ] = None,
     pairs: Annotated[list[Path] | None, "Write only the scans in this list of pairs; may be repeated."] = None,

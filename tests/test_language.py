@@ -22,7 +22,8 @@ CODE = sorted(
     for file in (ROOT / part).rglob("*.py")
     if file != Path(__file__)
 )
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+TEXTS = ROOT / "segslam" / "output" / "words.toml"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", TEXTS, *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def _texts(file: Path) -> list[tuple[int, str]]:

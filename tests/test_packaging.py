@@ -40,7 +40,8 @@ def test_a_wheel_in_a_bare_environment_maps_a_simulated_drive(tmp_path: Path) ->
     _run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", tmp_path, ROOT, folder=tmp_path)
     (wheel,) = tmp_path.glob("segslam-*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
-    assert {"segslam/py.typed", "segslam/output/report/interactive.js"} <= names
+    assert {"segslam/py.typed", "segslam/output/words.toml"} <= names
+    assert {f"segslam/output/report/{name}" for name in ("interactive.js", "style.css")} <= names
     assert not any(name.startswith(("tests/", "tools/", "docs/")) for name in names)
     _run(sys.executable, "-m", "venv", "bare", folder=tmp_path)
     scripts = tmp_path / "bare" / "bin"

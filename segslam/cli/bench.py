@@ -41,7 +41,7 @@ app = typer.Typer(
 
 LOST_PERCENT = [10.0, 30.0, 50.0, 70.0, 90.0]
 
-DataArgument = Annotated[Path, typer.Argument(help="KITTI folder, with real or simulated scans.")]
+DataArgument = Annotated[Path, "KITTI folder, with real or simulated scans."]
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,7 @@ class Options:
     """The options common to all experiments."""
 
     pairs: Annotated[
-        list[Path] | None,
-        typer.Option(help="List of pairs: one `source target` per line, or JSON with their poses; may be repeated."),
+        list[Path] | None, "List of pairs: one `source target` per line, or JSON with their poses; may be repeated."
     ] = None
     min_m: Annotated[
         float | None, typer.Option(min=0, help="Make a list from the true poses: smallest distance of a pair (m).")
@@ -71,16 +70,11 @@ class Options:
     labels: LabelsOption = "auto"
     encoding: EncodingOption = None
     workers: Annotated[int, typer.Option(min=1, help="Number of processes on this machine (extra `cluster`).")] = 1
-    scheduler: Annotated[
-        str | None, typer.Option(help="Address of a Dask cluster with access to DATA (extra `cluster`).")
-    ] = None
+    scheduler: Annotated[str | None, "Address of a Dask cluster with access to DATA (extra `cluster`)."] = None
     out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder for the report and the rows; the same command continues an interrupted benchmark there."
-        ),
+        Path | None, "Folder for the report and the rows; the same command continues an interrupted benchmark there."
     ] = None
-    details: Annotated[Path | None, typer.Option(help="CSV file to write, one row per registration.")] = None
+    details: Annotated[Path | None, "CSV file to write, one row per registration."] = None
     draw: Annotated[int, typer.Option(min=0, help="Draw the N worst failures; needs --out.")] = 0
     overwrite: OverwriteOption = False
 
@@ -133,9 +127,7 @@ def deterioration(
     lost_percent: Annotated[
         list[float], typer.Option("--lost", min=0, max=100, help="Percentage of labels to remove; may be repeated.")
     ] = LOST_PERCENT,
-    clouds: Annotated[
-        Literal["one", "both"], typer.Option(help="Remove labels from the source only, or from both scans.")
-    ] = "both",
+    clouds: Annotated[Literal["one", "both"], "Remove labels from the source only, or from both scans."] = "both",
     draws: Annotated[int, typer.Option(min=1, help="Number of random draws at each percentage.")] = 10,
     terminal: Terminal,
 ) -> None:
@@ -151,13 +143,11 @@ def deterioration(
 @app.command()
 @with_options
 def places(
-    file: Annotated[
-        Path, typer.Argument(help="Places: a .npz with `columns` (n, size, size) uint8 and `poses` (n, 3, 4).")
-    ],
+    file: Annotated[Path, "Places: a .npz with `columns` (n, size, size) uint8 and `poses` (n, 3, 4)."],
     *,
-    database: Annotated[str, typer.Option(help="Rows of the database: A:B, B excluded.")],
-    queries: Annotated[str, typer.Option(help="Rows of the queries: C:D.")],
-    turned: Annotated[bool, typer.Option(help="Rotate each query by a random yaw.")] = False,
+    database: Annotated[str, "Rows of the database: A:B, B excluded."],
+    queries: Annotated[str, "Rows of the queries: C:D."],
+    turned: Annotated[bool, "Rotate each query by a random yaw."] = False,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of --turned.")] = 0,
     terminal: Terminal,
 ) -> None:

@@ -8,10 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from segslam.cli import completion
 from segslam.cli.checks import check_exists, check_free, check_own, check_run
 from segslam.cli.console import Terminal
-from segslam.cli.options import OverwriteOption
+from segslam.cli.options import OverwriteOption, set_option
 from segslam.cli.tables import TableFiles, as_text, with_meanings
 from segslam.core.errors import SegslamError, WorkFailed
 from segslam.core.interrupts import when_stopped
@@ -23,9 +22,7 @@ SOURCE = "replayed.txt"
 def compare(
     runs: Annotated[list[Path], typer.Argument(help="Run folders, two or more.", metavar="RUN RUN...")],
     *,
-    plot: Annotated[
-        Path | None, typer.Option(help="Draw the trajectories and their errors to this file: .png, .svg or .pdf.")
-    ] = None,
+    plot: Annotated[Path | None, "Draw the trajectories and their errors to this file: .png, .svg or .pdf."] = None,
     tables: TableFiles,
     overwrite: OverwriteOption = False,
     terminal: Terminal,
@@ -39,8 +36,9 @@ def compare(
     names = _names(runs)
     check_free([plot, tables.csv, tables.latex], overwrite=overwrite)
     terminal.announce(f"compare: reading {len(runs)} runs")
-    from segslam.output.finished import FIGURES, read_metrics, read_run
+    from segslam.output.finished import read_metrics, read_run
     from segslam.output.report.comparison import check_picture, draw_runs
+    from segslam.output.words import FIGURES
 
     if plot is not None:
         check_picture(plot)
@@ -64,17 +62,12 @@ def _names(runs: list[Path]) -> list[str]:
 
 
 def sweep(
-    run: Annotated[Path, typer.Argument(help="Run folder, or its log.mcap.")],
+    run: Annotated[Path, "Run folder, or its log.mcap."],
     *,
-    out: Annotated[Path, typer.Option(help="Folder for the replays; what is there already is not done again.")],
+    out: Annotated[Path, "Folder for the replays; what is there already is not done again."],
     settings: Annotated[
         list[str],
-        typer.Option(
-            "--set",
-            metavar="SECTION.KEY=A,B,C",
-            autocompletion=completion.settings,
-            help="Values of a setting; of several settings, all combinations are replayed.",
-        ),
+        set_option("Values of a setting; of several settings, all combinations are replayed.", values="A,B,C"),
     ],
     workers: Annotated[int, typer.Option(min=1, help="Number of processes on this machine.")] = 1,
     scheduler: Annotated[

@@ -55,9 +55,7 @@ def _without_warnings(quiet: bool) -> bool:
 class Terminal:
     """Options of nearly every command, and how it answers: results on standard output, all else on standard error."""
 
-    json: Annotated[
-        bool, typer.Option(help="Print the figures as one JSON object on standard output, and nothing else there.")
-    ] = False
+    json: Annotated[bool, "Print the figures as one JSON object on standard output, and nothing else there."] = False
     quiet: Annotated[
         bool,
         typer.Option(

@@ -24,6 +24,14 @@ TROUBLE = (
     ),
 )
 """Counts that are reported unless they are 0: key, noun, text."""
+NOTES = {
+    "kiss_icp_ate_m": "the same error of KISS-ICP alone: {kiss_icp_ate_m:.3f} m",
+    "localised_percent": "localised in the old map: {localised_percent:.1f} % of the scans; see localised.csv",
+    "num_loops_between": "loops between sessions: {num_loops_between}, "
+    "{num_loops_between_switched_off} rejected by the optimiser",
+    "num_scans_resumed": "{num_scans_resumed} of the scans were resumed from the log; the rate is that of the others",
+}
+"""Lines about figures that some runs have: key, text."""
 
 
 def is_interrupted(items: Iterable[object]) -> bool:
@@ -93,17 +101,7 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
         false = f"; false loops: {metrics['num_loops_false']}" if "num_loops_false" in metrics else ""
         odometry = f"odometry {repaired}: {metrics['odometry_ate_m']:.3f} m"
         lines.append(f"error after alignment: {metrics['ate_m']:.3f} m, {odometry}{false}")
-        if (alone_m := metrics.get("kiss_icp_ate_m")) is not None:
-            lines.append(f"the same error of KISS-ICP alone: {alone_m:.3f} m")
-    if "localised_percent" in metrics:
-        lines.append(f"localised in the old map: {metrics['localised_percent']:.1f} % of the scans; see localised.csv")
-    if "num_loops_between" in metrics:
-        rejected = metrics["num_loops_between_switched_off"]
-        lines.append(f"loops between sessions: {metrics['num_loops_between']}, {rejected} rejected by the optimiser")
-    if "num_scans_resumed" in metrics:
-        lines.append(
-            f"{metrics['num_scans_resumed']} of the scans were resumed from the log; the rate is that of the others"
-        )
+    lines += [text.format_map(metrics) for key, text in NOTES.items() if metrics.get(key) is not None]
     if "num_loops_won" in metrics:
         before = f"; error of the logged run: {metrics['recorded_ate_m']:.3f} m" if "recorded_ate_m" in metrics else ""
         lines.append(

@@ -18,19 +18,15 @@ class Scoring:
     """How poses are read, matched and aligned."""
 
     format: Annotated[
-        Literal["kitti", "tum"] | None,
-        typer.Option(help="Format of both files; detected from the number of columns by default."),
+        Literal["kitti", "tum"] | None, "Format of both files; detected from the number of columns by default."
     ] = None
     up: Annotated[
-        Literal["z", "-y"] | None,
-        typer.Option(help="Upward axis of the two files: z, or -y for cameras; by default found from the path."),
+        Literal["z", "-y"] | None, "Upward axis of the two files: z, or -y for cameras; by default found from the path."
     ] = None
-    max_difference: Annotated[
-        float, typer.Option(help="Largest time difference between a pose and its reference (s).")
-    ] = 0.01
+    max_difference: Annotated[float, "Largest time difference between a pose and its reference (s)."] = 0.01
     align: Annotated[
         Literal["se3", "sim3", "first", "none"],
-        typer.Option(help="Alignment: rigid (se3), with scale (sim3), of the first pose (first), or none."),
+        "Alignment: rigid (se3), with scale (sim3), of the first pose (first), or none.",
     ] = "se3"
     rpe_distance: Annotated[
         float | None,
@@ -39,21 +35,13 @@ class Scoring:
 
 
 def evaluate(
-    run: Annotated[
-        Path | None, typer.Argument(help="Run folder; its metrics.json is updated with the new figures.")
-    ] = None,
+    run: Annotated[Path | None, "Run folder; its metrics.json is updated with the new figures."] = None,
     *,
-    reference: Annotated[
-        Path | None, typer.Option(help="Ground-truth poses, KITTI or TUM format; a folder if --estimate is one.")
-    ] = None,
-    estimate: Annotated[
-        Path | None, typer.Option(help="Estimated poses, or a folder with poses NAME.txt of several drives.")
-    ] = None,
+    reference: Annotated[Path | None, "Ground-truth poses, KITTI or TUM format; a folder if --estimate is one."] = None,
+    estimate: Annotated[Path | None, "Estimated poses, or a folder with poses NAME.txt of several drives."] = None,
     how: Scoring,
     tables: TableFiles,
-    plot: Annotated[
-        Path | None, typer.Option(help="Draw both trajectories and the error to this file: .png, .svg or .pdf.")
-    ] = None,
+    plot: Annotated[Path | None, "Draw both trajectories and the error to this file: .png, .svg or .pdf."] = None,
     overwrite: OverwriteOption = False,
     terminal: Terminal,
 ) -> None:
@@ -91,10 +79,10 @@ def evaluate(
     if how.rpe_distance is not None and not any("rpe_distance_m" in row for row in rows.values()):
         terminal.say(f"--rpe-distance {how.rpe_distance:g}: no drive is that long; the error over it is not given")
     tables.write(rows)
-    from segslam.output.accuracy import AFTER, MEANINGS
-    from segslam.output.finished import FIGURES
+    from segslam.output.accuracy import AFTER
+    from segslam.output.words import FIGURES, SCORES
 
-    meanings = {"ate_m": FIGURES["ate_m"]} | MEANINGS | FIGURES
+    meanings = {"ate_m": FIGURES["ate_m"]} | SCORES | FIGURES
     meanings = {key: words.replace(AFTER["se3"], AFTER[how.align]) for key, words in meanings.items()}
     terminal.table(figures, as_text(rows) if "drives" in figures else with_meanings([figures], meanings))
     if plot is not None and not terminal.json:

@@ -15,13 +15,11 @@ FormatOf = Literal["kitti", "tum", "csv"] | None
 
 
 def export(
-    run: Annotated[Path, typer.Argument(help="Folder of a finished run.")],
+    run: Annotated[Path, "Folder of a finished run."],
     files: Annotated[
         list[Path],
-        typer.Argument(
-            help="Files to write: .ply .pcd .las .laz (cloud), .png (top view), .yaml (grid), or before_after.png; of "
-            "a georeferenced run also .tif (GeoTIFF), .geojson .kml .gpx (trajectory), map_projector_info.yaml."
-        ),
+        "Files to write: .ply .pcd .las .laz (cloud), .png (top view), .yaml (grid), or before_after.png; of "
+        "a georeferenced run also .tif (GeoTIFF), .geojson .kml .gpx (trajectory), map_projector_info.yaml.",
     ],
     *,
     changes: Settings,
@@ -56,13 +54,11 @@ def convert(
     target_format: Annotated[
         FormatOf, typer.Option("--to", help="Format of OUT; by default by its name, else TUM if there are stamps.")
     ] = None,
-    times: Annotated[
-        Path | None, typer.Option(help="KITTI's times.txt: one time (s) a line, for poses without stamps.")
-    ] = None,
-    calib: Annotated[Path | None, typer.Option(help="KITTI's calib.txt, for --to-frame.")] = None,
+    times: Annotated[Path | None, "KITTI's times.txt: one time (s) a line, for poses without stamps."] = None,
+    calib: Annotated[Path | None, "KITTI's calib.txt, for --to-frame."] = None,
     to_frame: Annotated[
         Literal["camera", "lidar"] | None,
-        typer.Option(help="Write poses of the LiDAR for those of the camera, or the reverse; needs --calib."),
+        "Write poses of the LiDAR for those of the camera, or the reverse; needs --calib.",
     ] = None,
     overwrite: OverwriteOption = False,
     terminal: Terminal,
@@ -77,20 +73,12 @@ def convert(
     from segslam.output.conversion import convert as convert_file
 
     num_poses = convert_file(
-        source,
-        target,
-        source_format=source_format,
-        target_format=target_format,
-        times=times,
-        calib=calib,
-        to=to_frame,
+        source, target, source_format=source_format, target_format=target_format, times=times, calib=calib, to=to_frame
     )
     terminal.answer({"num_poses": num_poses, "file": str(target)}, f"{num_poses} poses in {target}")
 
 
-def georeference(
-    run: Annotated[Path, typer.Argument(help="Folder of a finished run.")], *, gnss: GnssOptions, terminal: Terminal
-) -> None:
+def georeference(run: Annotated[Path, "Folder of a finished run."], *, gnss: GnssOptions, terminal: Terminal) -> None:
     """Place a finished run on the globe by its position fixes, right also where the receiver is wrong.
 
     Writes georeference.json, gnss.csv (each fix: kept, or why not), poses_geodetic.csv and poses_enu_tum.txt into its

@@ -46,18 +46,14 @@ COARSER = 1.5
 
 
 def live(
-    out: Annotated[Path, typer.Option(help="New folder for the run.")],
+    folder: Annotated[Path | None, "Folder into which a recorder writes scans (.bin .npy .ply .pcd)."] = None,
     *,
-    folder: Annotated[
-        Path | None, typer.Argument(help="Folder into which a recorder writes scans (.bin .npy .ply .pcd).")
-    ] = None,
-    topic: Annotated[
-        str | None, typer.Option(help="ROS 2 topic of sensor_msgs/PointCloud2 messages, instead of a folder.")
-    ] = None,
+    out: Annotated[Path, "New folder for the run."],
+    topic: Annotated[str | None, "ROS 2 topic of sensor_msgs/PointCloud2 messages, instead of a folder."] = None,
     idle: Annotated[
         float | None, typer.Option(min=0.1, metavar="SECONDS", help="End after this time without a new scan.")
     ] = None,
-    labels: Annotated[str, typer.Option(help="Labels: geometric (auto is the same) or none.")] = "auto",
+    labels: Annotated[str, "Labels: geometric (auto is the same) or none."] = "auto",
     preset: PresetOption = "auto",
     output: RunOutput,
     gnss: GnssOptions,

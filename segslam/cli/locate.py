@@ -81,12 +81,10 @@ def _is_word(label_source: str) -> bool:
 
 
 def locate(
-    run: Annotated[Path, typer.Argument(help="Folder of a finished run, or its log.mcap.")],
-    scans: Annotated[list[Path], typer.Argument(help="Scans to locate: .bin, .npy, .ply or .pcd.")],
+    run: Annotated[Path, "Folder of a finished run, or its log.mcap."],
+    scans: Annotated[list[Path], "Scans to locate: .bin, .npy, .ply or .pcd."],
     *,
-    labels: Annotated[
-        str, typer.Option(help="Labels: geometric, none, or a folder of .label files named like the scans.")
-    ] = "geometric",
+    labels: Annotated[str, "Labels: geometric, none, or a folder of .label files named like the scans."] = "geometric",
     files: ScanFileOptions,
     terminal: Terminal,
 ) -> None:
@@ -138,8 +136,8 @@ def locate(
 
 
 def register(
-    source: Annotated[Path, typer.Argument(help="Scan to align: .bin, .npy, .ply or .pcd.")],
-    target: Annotated[Path, typer.Argument(help="Fixed scan.")],
+    source: Annotated[Path, "Scan to align: .bin, .npy, .ply or .pcd."],
+    target: Annotated[Path, "Fixed scan."],
     *,
     labels: Annotated[
         list[str] | None,

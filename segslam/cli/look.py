@@ -5,8 +5,6 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
 from segslam.cli.checks import check_free, check_links, check_run
 from segslam.cli.console import Terminal
 from segslam.cli.ending import counted
@@ -39,11 +37,9 @@ def info(run: LogArgument, *, terminal: Terminal) -> None:
 
 
 def view(
-    run: Annotated[Path, typer.Argument(help="Run folder, finished or not.")],
+    run: Annotated[Path, "Run folder, finished or not."],
     *,
-    save: Annotated[
-        Path | None, typer.Option(help="Write a .rrd file for Rerun instead of opening the viewer.")
-    ] = None,
+    save: Annotated[Path | None, "Write a .rrd file for Rerun instead of opening the viewer."] = None,
     overwrite: OverwriteOption = False,
     terminal: Terminal,
 ) -> None:
@@ -68,9 +64,7 @@ def view(
     terminal.answer(figures, f"written to {save}" if save else "all steps are in the viewer")
 
 
-def report(
-    run: Annotated[Path, typer.Argument(help="Run folder; report.html is written there.")], *, terminal: Terminal
-) -> None:
+def report(run: Annotated[Path, "Run folder; report.html is written there."], *, terminal: Terminal) -> None:
     """Write the report of a run again: one HTML page with the map, plots and tables.
 
     Example: segslam report runs/00
@@ -109,7 +103,7 @@ def _found_in(log: "RunLog") -> dict[str, Any]:
 
 def _lines(found: dict[str, Any]) -> str:
     """The content as text, for 80 columns."""
-    from segslam.output.finished import FIGURES
+    from segslam.output.words import FIGURES
 
     num_steps = counted(found["num_steps"], "scan")
     then = f"; continue with: segslam resume {shlex.quote(found['run'])}" if found["state"] == "interrupted" else ""

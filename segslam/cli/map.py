@@ -45,15 +45,11 @@ FREE_OPTIONS = ("data", "dataset", "sequence", "map_files", "gnss", "gnss_use", 
 def map_command(
     data: DataArgument,
     *,
-    out: Annotated[
-        Path | None, typer.Option(help="New folder for the run; with --resume the folder of the run.  [required]")
-    ] = None,
+    out: Annotated[Path | None, "New folder for the run; with --resume the folder of the run.  [required]"] = None,
     options: RunOptions,
     output: RunOutput,
     gnss: GnssOptions,
-    dry_run: Annotated[
-        bool, typer.Option(help="Show the content of DATA and the settings; write nothing. Needs no --out.")
-    ] = False,
+    dry_run: Annotated[bool, "Show the content of DATA and the settings; write nothing. Needs no --out."] = False,
     terminal: Terminal,
 ) -> None:
     """Map scans: write the corrected trajectory, the loops, a log, a report and, with ground truth, the error.
@@ -66,10 +62,10 @@ def map_command(
 
 
 def localise(
-    run: Annotated[Path, typer.Argument(help="Folder of the finished run that provides the map. It is not changed.")],
+    run: Annotated[Path, "Folder of the finished run that provides the map. It is not changed."],
     data: DataArgument,
     *,
-    out: Annotated[Path, typer.Option(help="New folder for the run; with --resume the folder of the run.")],
+    out: Annotated[Path, "New folder for the run; with --resume the folder of the run."],
     options: RunOptions,
     output: RunOutput,
     terminal: Terminal,
@@ -85,7 +81,7 @@ def localise(
 
 
 def resume(
-    run: Annotated[Path, typer.Argument(help="Folder of the interrupted run.")],
+    run: Annotated[Path, "Folder of the interrupted run."],
     *,
     view: ViewOption = False,
     terminal: Terminal,

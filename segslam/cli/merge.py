@@ -16,9 +16,9 @@ from segslam.core.interrupts import EXIT_STATUS, when_stopped
 def merge(
     runs: Annotated[list[Path], typer.Argument(help="Folders of finished runs, two or more.", metavar="RUN RUN...")],
     *,
-    out: Annotated[Path, typer.Option(help="New folder for the merged run.")],
+    out: Annotated[Path, "New folder for the merged run."],
     same_reference: Annotated[
-        bool, typer.Option(help="The true poses of all runs are in one frame: score the merged trajectory.")
+        bool, "The true poses of all runs are in one frame: score the merged trajectory."
     ] = False,
     with_map: WithMapOption = False,
     changes: RunSettings,
@@ -63,7 +63,7 @@ def fleet(
         typer.Argument(help="A list of recordings in YAML, or the recordings themselves.", metavar="LIST.yaml|DATA..."),
     ],
     *,
-    out: Annotated[Path, typer.Option(help="Folder of the fleet; what is there already is not done again.")],
+    out: Annotated[Path, "Folder of the fleet; what is there already is not done again."],
     scheduler: Annotated[
         str | None,
         typer.Option(help="Dask scheduler whose workers do the work, as tcp://HOST:8786.", metavar="ADDRESS"),
@@ -72,9 +72,7 @@ def fleet(
         int | None,
         typer.Option(help="Number of processes on this machine, by default one for two cores.", min=1),
     ] = None,
-    same_reference: Annotated[
-        bool, typer.Option(help="The true poses of all drives are in one frame: score each component.")
-    ] = False,
+    same_reference: Annotated[bool, "The true poses of all drives are in one frame: score each component."] = False,
     changes: Settings,
     terminal: Terminal,
 ) -> None:

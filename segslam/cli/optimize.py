@@ -17,16 +17,14 @@ if TYPE_CHECKING:
 
 
 def optimize(
-    graph: Annotated[Path, typer.Argument(help="g2o file with VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines.")],
+    graph: Annotated[Path, "g2o file with VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines."],
     *,
-    out: Annotated[Path, typer.Option(help="g2o file to write: the same edges, with the optimised vertices.")],
+    out: Annotated[Path, "g2o file to write: the same edges, with the optimised vertices."],
     robust: Annotated[
         Literal["none", "huber", "cauchy", "geman-mcclure", "gnc", "consistent"],
-        typer.Option(
-            help="Treatment of edges between distant ids. consistent: reject outliers, starting from the largest "
-            "pairwise-consistent set, as map does; gnc: reject outliers by graduated non-convexity; huber, cauchy, "
-            "geman-mcclure: robust kernel; none: keep all (least squares)."
-        ),
+        "Treatment of edges between distant ids. consistent: reject outliers, starting from the largest "
+        "pairwise-consistent set, as map does; gnc: reject outliers by graduated non-convexity; huber, cauchy, "
+        "geman-mcclure: robust kernel; none: keep all (least squares).",
     ] = "consistent",
     overwrite: OverwriteOption = False,
     force: Annotated[bool, typer.Option(hidden=True, help="The same as --overwrite.")] = False,

@@ -26,8 +26,8 @@ GNSS_USES = ("fuse", "align")
 MOST_OFFSET_S = 4e9
 """As far as the clock of a computer that begins in 1970 can be off."""
 
-DataArgument = Annotated[Path, typer.Argument(help="Folder of scans, recording, or KITTI folder (with sequences/).")]
-LogArgument = Annotated[Path, typer.Argument(help="Run folder, or its log.mcap, finished or not.")]
+DataArgument = Annotated[Path, "Folder of scans, recording, or KITTI folder (with sequences/)."]
+LogArgument = Annotated[Path, "Run folder, or its log.mcap, finished or not."]
 DatasetOption = Annotated[
     str | None,
     typer.Option(
@@ -36,10 +36,7 @@ DatasetOption = Annotated[
 ]
 Numbering = Literal["raw", "learning", "learning-0"]
 EncodingOption = Annotated[
-    Numbering | None,
-    typer.Option(
-        help="Numbering of the label files, if it cannot be detected: raw, learning (0-19), learning-0 (0-18)."
-    ),
+    Numbering | None, "Numbering of the label files, if it cannot be detected: raw, learning (0-19), learning-0 (0-18)."
 ]
 FoxgloveOption = Annotated[
     str | None,
@@ -55,7 +52,7 @@ LabelsOption = Annotated[
         help="Labels: auto (labels/ if present, else geometric), none, geometric, network:MODEL.onnx, or a folder.",
     ),
 ]
-OverwriteOption = Annotated[bool, typer.Option(help="Replace the run or the files that exist under this name.")]
+OverwriteOption = Annotated[bool, "Replace the run or the files that exist under this name."]
 PresetOption = Annotated[
     str,
     typer.Option(
@@ -63,29 +60,26 @@ PresetOption = Annotated[
         help="Settings for an environment: driving, campus or indoor; auto: by the scans.",
     ),
 ]
-SequenceOption = Annotated[str, typer.Option(help="Sequence of the data set.")]
-ViewOption = Annotated[bool, typer.Option(help="Show the run in the Rerun viewer while it is mapped.")]
+SequenceOption = Annotated[str, "Sequence of the data set."]
+ViewOption = Annotated[bool, "Show the run in the Rerun viewer while it is mapped."]
 WithMapOption = Annotated[
     bool, typer.Option("--map", help="Also write the map: map.ply (cloud) and map.png (top view).")
 ]
+
+
+def set_option(
+    text: str, *, values: str = "VALUE", completed: Callable[[str], list[str]] = completion.settings
+) -> OptionInfo:
+    """An option `--set` with its help; `values`: what it shows behind the equals sign."""
+    return typer.Option("--set", metavar=f"SECTION.KEY={values}", autocompletion=completed, help=text)
 
 
 @dataclass(frozen=True)
 class Settings:
     """The settings of a command."""
 
-    config: Annotated[Path | None, typer.Option(help="YAML file with the settings that differ from the defaults.")] = (
-        None
-    )
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="SECTION.KEY=VALUE",
-            autocompletion=completion.settings,
-            help="Change one setting: section.key=value; may be repeated.",
-        ),
-    ] = None
+    config: Annotated[Path | None, "YAML file with the settings that differ from the defaults."] = None
+    settings: Annotated[list[str] | None, set_option("Change one setting: section.key=value; may be repeated.")] = None
 
     def overrides(self) -> list[str]:
         """Changes of single settings, as for `load_config`."""
@@ -126,9 +120,7 @@ class RunOutput(RunSettings):
     with_map: WithMapOption = False
     map_file: Annotated[
         list[Path] | None,
-        typer.Option(
-            help="Also write the map to this file in the run folder: .ply .pcd .las .laz .png .yaml; may be repeated."
-        ),
+        "Also write the map to this file in the run folder: .ply .pcd .las .laz .png .yaml; may be repeated.",
     ] = None
     view: ViewOption = False
     foxglove: FoxgloveOption = None
@@ -154,9 +146,7 @@ class ScanOptions:
     frames: Annotated[
         str | None, typer.Option(metavar="A:B[:STEP]", help="Use scans A to B by number, B excluded; every STEP-th.")
     ] = None
-    topic: Annotated[
-        str, typer.Option(help="Point cloud topic, if the recording (rosbag, mcap) has more than one.")
-    ] = ""
+    topic: Annotated[str, "Point cloud topic, if the recording (rosbag, mcap) has more than one."] = ""
 
     def source(self, data: Path, labels: str = "none", encoding: Any = None) -> "DataSource":
         """What opens the scans."""
@@ -171,11 +161,9 @@ class RunOptions(ScanOptions):
 
     labels: LabelsOption = "auto"
     encoding: EncodingOption = None
-    odometry: Annotated[
-        Path | None, typer.Option(help="Trajectory to use instead of KISS-ICP (KITTI or TUM format, LiDAR frame).")
-    ] = None
+    odometry: Annotated[Path | None, "Trajectory to use instead of KISS-ICP (KITTI or TUM format, LiDAR frame)."] = None
     preset: PresetOption = "auto"
-    resume: Annotated[bool, typer.Option(help="Continue the interrupted run in --out.")] = False
+    resume: Annotated[bool, "Continue the interrupted run in --out."] = False
 
 
 @dataclass(frozen=True)
@@ -190,10 +178,8 @@ class GnssOptions:
             metavar="FIXES",
         ),
     ] = None
-    gnss_use: Annotated[
-        str, typer.Option(help="fuse: also bend the map where held-out fixes confirm it; align: only place it.")
-    ] = "fuse"
-    gnss_offset: Annotated[float, typer.Option(help="Seconds to add to the times of the fixes.")] = 0.0
+    gnss_use: Annotated[str, "fuse: also bend the map where held-out fixes confirm it; align: only place it."] = "fuse"
+    gnss_offset: Annotated[float, "Seconds to add to the times of the fixes."] = 0.0
 
     def __post_init__(self) -> None:
         if self.gnss is not None and not abs(self.gnss_offset) < MOST_OFFSET_S:
@@ -250,8 +236,9 @@ class GnssOptions:
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
     """The command with the fields of each parameter that is annotated with a dataclass in place of that parameter.
 
-    An option without a name of its own is called like its parameter; a flag has no opposite `--no-...`. The help shows
-    PATH, TEXT, N or NUMBER for a value, also for lists and optional values.
+    A text that annotates a parameter is its help: it makes an argument of a positional parameter, and an option of a
+    keyword and of a field. An option without a name of its own is called like its parameter; a flag has no opposite
+    `--no-...`. The help shows PATH, TEXT, N or NUMBER for a value, also for lists and optional values.
     """
     own = inspect.signature(command, eval_str=True)
     records: dict[str, type[Any]] = {
@@ -267,19 +254,25 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
         command(**values)
 
     parameters = [
-        parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        _declared(each, is_argument=name not in records and one.kind is not one.KEYWORD_ONLY)
         for name, one in own.parameters.items()
-        for parameter in (inspect.signature(records[name]).parameters.values() if name in records else [one])
+        for each in (inspect.signature(records[name]).parameters.values() if name in records else [one])
     ]
-    for one in parameters:
-        option = one.annotation.__metadata__[0]
-        if isinstance(option, OptionInfo):
-            option.metavar = option.metavar or _value_name(one.annotation.__origin__)
-            if option.default is ...:  # where typer has the first name
-                option.param_decls = (f"--{one.name.replace('_', '-')}",)
     flat.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
     flat.__annotations__ = {one.name: one.annotation for one in parameters}
     return flat
+
+
+def _declared(parameter: inspect.Parameter, *, is_argument: bool) -> inspect.Parameter:
+    """The parameter as typer takes it."""
+    hint, about = parameter.annotation.__origin__, parameter.annotation.__metadata__[0]
+    if isinstance(about, str):
+        about = typer.Argument(help=about) if is_argument else typer.Option(help=about)
+    if isinstance(about, OptionInfo):
+        about.metavar = about.metavar or _value_name(hint)
+        if about.default is ...:  # where typer has the first name
+            about.param_decls = (f"--{parameter.name.replace('_', '-')}",)
+    return parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[hint, about])
 
 
 def _value_name(hint: Any) -> str | None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from segslam.run.run import Run
     from segslam.slam.slam_result import SlamResult
 
-OutOption = Annotated[Path, typer.Option(help="New folder for the run.")]
+OutOption = Annotated[Path, "New folder for the run."]
 
 
 def replay(
@@ -57,9 +57,7 @@ def edit(
             metavar="I:J", help="Register these two keyframes, wherever the drift has put them; may be repeated."
         ),
     ] = None,
-    add_near_fixes: Annotated[
-        bool, typer.Option(help="Add keyframes that the fixes of the run place near each other.")
-    ] = False,
+    add_near_fixes: Annotated[bool, "Add keyframes that the fixes of the run place near each other."] = False,
     changes: RunSettings,
     terminal: Terminal,
 ) -> None:
@@ -79,7 +77,7 @@ def edit(
 def refine(
     run: LogArgument,
     *,
-    out: Annotated[Path, typer.Option(help="New folder for the adjusted run.")],
+    out: Annotated[Path, "New folder for the adjusted run."],
     with_map: WithMapOption = False,
     changes: RunSettings,
     terminal: Terminal,

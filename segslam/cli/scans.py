@@ -17,21 +17,19 @@ if TYPE_CHECKING:
     from segslam.slam.adjustment.vertical_angle import VerticalAngle
 
 logger = logging.getLogger(__name__)
-DriveArgument = Annotated[Path, typer.Argument(help="KITTI folder (with sequences/), folder of scans, or recording.")]
+DriveArgument = Annotated[Path, "KITTI folder (with sequences/), folder of scans, or recording."]
 
 
 def label(
     data: DriveArgument,
     *,
-    out: Annotated[Path, typer.Option(help="New folder for the labels and pictures.")],
+    out: Annotated[Path, "New folder for the labels and pictures."],
     labels: LabelsOption,
-    truth: Annotated[Path | None, typer.Option(help="Folder of true .label files to compare with.")] = None,
+    truth: Annotated[Path | None, "Folder of true .label files to compare with."] = None,
     options: ScanOptions,
     encoding: EncodingOption = None,
-    truth_encoding: Annotated[
-        Numbering | None, typer.Option(help="Numbering of the true labels, if it cannot be detected.")
-    ] = None,
-    write_as: Annotated[Numbering, typer.Option(help="Numbering of the written label files.")] = "raw",
+    truth_encoding: Annotated[Numbering | None, "Numbering of the true labels, if it cannot be detected."] = None,
+    write_as: Annotated[Numbering, "Numbering of the written label files."] = "raw",
     pictures: Annotated[int, typer.Option(min=0, help="Number of scans to draw, spread evenly over the drive.")] = 1,
     changes: Settings,
     overwrite: OverwriteOption = False,

@@ -9,7 +9,7 @@ from segslam.cli.checks import check_own, make_folder
 from segslam.cli.completion import simulation_settings
 from segslam.cli.console import Terminal, how_to_go_on
 from segslam.cli.map import map_data
-from segslam.cli.options import GnssOptions, OverwriteOption, RunOptions, RunOutput
+from segslam.cli.options import GnssOptions, OverwriteOption, RunOptions, RunOutput, set_option
 from segslam.core.errors import SegslamError
 from segslam.core.interrupts import interrupts_wait, same_command_with, when_stopped
 
@@ -25,14 +25,11 @@ scans have the same distortion, so they still match."""
 
 
 def simulate(
-    out: Annotated[Path, typer.Argument(help="Folder to write, in KITTI's layout: sequences/NN/..., poses/NN.txt.")],
+    out: Annotated[Path, "Folder to write, in KITTI's layout: sequences/NN/..., poses/NN.txt."],
     *,
-    sequence: Annotated[str, typer.Option(help="Name of the sequence to write.")] = "00",
+    sequence: Annotated[str, "Name of the sequence to write."] = "00",
     poses: Annotated[
-        Path | None,
-        typer.Option(
-            help="KITTI pose file (camera frame) to drive along, levelled; default: a generated loop of streets."
-        ),
+        Path | None, "KITTI pose file (camera frame) to drive along, levelled; default: a generated loop of streets."
     ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Number of scans; default: the whole drive.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed; the same seed gives the same scans.")] = 0,
@@ -45,19 +42,14 @@ def simulate(
     lane: Annotated[
         float, typer.Option(min=-4, max=4, help="Offset to the left of the path (m); negative: to the right.")
     ] = 0.0,
-    reverse: Annotated[bool, typer.Option(help="Drive the path in the opposite direction.")] = False,
+    reverse: Annotated[bool, "Drive the path in the opposite direction."] = False,
     settings: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="SECTION.KEY=VALUE",
-            autocompletion=simulation_settings,
-            help="Change a setting of the world or the sensor, for example world.cars=3.",
+        set_option(
+            "Change a setting of the world or the sensor, for example world.cars=3.", completed=simulation_settings
         ),
     ] = None,
-    pairs: Annotated[
-        list[Path] | None, typer.Option(help="Write only the scans in this list of pairs; may be repeated.")
-    ] = None,
+    pairs: Annotated[list[Path] | None, "Write only the scans in this list of pairs; may be repeated."] = None,
     sample: Annotated[
         int | None, typer.Option(min=1, help="Use only N pairs of each list, those of `bench --sample N --seed 0`.")
     ] = None,
@@ -103,7 +95,7 @@ def simulate(
 
 def demo(
     *,
-    out: Annotated[Path, typer.Option(help="New folder for the data and the run.")] = Path("segslam-demo"),
+    out: Annotated[Path, "New folder for the data and the run."] = Path("segslam-demo"),
     overwrite: OverwriteOption = False,
     terminal: Terminal,
 ) -> None:

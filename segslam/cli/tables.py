@@ -9,24 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from segslam.core.whole_files import write_whole
+from segslam.output.words import COLUMNS
 
-SHORT = {
-    "ate_m": "ATE (m)",
-    "ate_mean_m": "mean (m)",
-    "ate_median_m": "median (m)",
-    "ate_max_m": "max (m)",
-    "odometry_ate_m": "odometry (m)",
-    "kiss_icp_ate_m": "KISS-ICP (m)",
-    "rpe_over_distance_percent": "RPE (%)",
-    "kitti_translation_percent": "t (%)",
-    "kitti_rotation_deg_per_100m": "r (deg/100 m)",
-    "num_loops_accepted": "loops",
-    "num_poses": "poses",
-}
-"""Columns of a table for people: figures that at least one row has."""
 Rows = Mapping[str, Mapping[str, Any]]
 """Name -> figures."""
 
@@ -51,10 +36,8 @@ def with_meanings(columns: Sequence[Mapping[str, Any]], meanings: Mapping[str, s
 class TableFiles:
     """Options of commands with a table."""
 
-    csv: Annotated[Path | None, typer.Option(help="Write the table to this file, a row for each.")] = None
-    latex: Annotated[
-        Path | None, typer.Option(help="Write the table to this file as a LaTeX tabular, a row for each.")
-    ] = None
+    csv: Annotated[Path | None, "Write the table to this file, a row for each."] = None
+    latex: Annotated[Path | None, "Write the table to this file as a LaTeX tabular, a row for each."] = None
 
     def write(self, rows: Rows) -> None:
         """Write the files that are given: CSV has all numbers in full, LaTeX the columns for people."""
@@ -74,9 +57,9 @@ def as_csv(rows: Rows) -> str:
 
 
 def as_latex(rows: Rows) -> str:
-    """A tabular with the columns of `SHORT`, of package booktabs."""
+    """A tabular with the columns of `words.COLUMNS`, of package booktabs."""
     columns = _columns(rows)
-    head = " & ".join(["", *(_escaped(SHORT[key]) for key in columns)])
+    head = " & ".join(["", *(_escaped(COLUMNS[key]) for key in columns)])
     lines = [" & ".join([_escaped(name), *(_cell(row.get(key)) for key in columns)]) for name, row in rows.items()]
     body = " \\\\\n".join(lines)
     begin = f"\\begin{{tabular}}{{l{'r' * len(columns)}}}"
@@ -85,22 +68,22 @@ def as_latex(rows: Rows) -> str:
 
 
 def as_text(rows: Rows) -> str:
-    """The columns of `SHORT`, aligned; those that do not fit the terminal follow below."""
+    """The columns of `words.COLUMNS`, aligned; those that do not fit the terminal follow below."""
     within = shutil.get_terminal_size().columns
     first = max(map(len, rows), default=4)
     names = [f"{name:<{first}}" for name in ("", *rows)]
     parts = [names]
     for key in _columns(rows):
-        width = max(len(SHORT[key]), 7)
+        width = max(len(COLUMNS[key]), 7)
         if parts[-1] is not names and len(parts[-1][0]) + 2 + width > within:
             parts.append(names)
-        cells = (SHORT[key], *(_cell(row.get(key)) for row in rows.values()))
+        cells = (COLUMNS[key], *(_cell(row.get(key)) for row in rows.values()))
         parts[-1] = [f"{line}  {cell:>{width}}" for line, cell in zip(parts[-1], cells, strict=True)]
     return "\n\n".join("\n".join(lines) for lines in parts)
 
 
 def _columns(rows: Rows) -> list[str]:
-    return [key for key in SHORT if any(_is_number(row.get(key)) for row in rows.values())]
+    return [key for key in COLUMNS if any(_is_number(row.get(key)) for row in rows.values())]
 
 
 def _is_number(value: object) -> bool:

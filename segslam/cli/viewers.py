@@ -60,24 +60,27 @@ def scene_in(file: Path | None, *, named: Path | None = None) -> "Iterator[Scene
             f"the viewer is an optional package: {how_to_install('viewer')} (or open log.mcap in Foxglove)"
         ) from error
     viewer = rerun.RecordingStream("segslam")
-    try:
+    with _receives(named):
         if file is None:  # the program of the viewer is beside Python
             os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
             viewer.spawn()
         else:
             viewer.save(file)
         scene = Scene(viewer)
-    except (OSError, RuntimeError) as error:
-        raise _no_viewer(named, error) from error
     yield scene
-    try:
+    with _receives(named):
         scene.end()
+
+
+@contextmanager
+def _receives(file: Path | None) -> Iterator[None]:
+    """Context manager that raises SegslamError if the viewer fails within it, WorkFailed if it writes to a file."""
+    try:
+        yield
     except (OSError, RuntimeError) as error:
-        raise _no_viewer(named, error) from error
-
-
-def _no_viewer(file: Path | None, error: Exception) -> SegslamError:
-    reason = str(error).partition("\n")[0]
-    if file is None:
-        return SegslamError(f"the viewer cannot be opened or does not answer ({reason}); use --save FILE.rrd instead")
-    return WorkFailed(f"{file}: cannot be written ({reason}); free space there, or give another file")
+        reason = str(error).partition("\n")[0]
+        if file is not None:
+            raise WorkFailed(f"{file}: cannot be written ({reason}); free space there, or give another file") from error
+        raise SegslamError(
+            f"the viewer cannot be opened or does not answer ({reason}); use --save FILE.rrd instead"
+        ) from error

@@ -31,16 +31,6 @@ AFTER: dict[Align, str] = {
 """How an error was measured, in words."""
 MOST_OFF = 0.1
 """Largest difference between the length of a pair and the distance asked for, as a share; evo's default."""
-MEANINGS = {
-    "ate_mean_m": "the same error, mean (m)",
-    "ate_median_m": "the same error, median (m)",
-    "ate_max_m": "the same error, largest (m)",
-    "rpe_distance_m": "distance of the two figures below (m)",
-    "rpe_over_distance_m": "error of the motion over this distance, rms (m)",
-    "rpe_over_distance_percent": "the same error, mean, in percent of the distance (%)",
-    "scale": "scale of the estimate (alignment sim3)",
-}
-"""Meaning of the figures that only the evaluation has."""
 
 
 def accuracy(result: SlamResult, reference: Trajectory, *, align: Align = "se3") -> dict[str, float]:
@@ -86,7 +76,7 @@ def scores(
     rpe_distance_m: float | None = None,
     up: tuple[float, float, float] = Z_UP,
 ) -> dict[str, float]:
-    """The figures of `trajectory_metrics` after this alignment, and those of `MEANINGS`; (n, 4, 4) each, row by row.
+    """The figures of `trajectory_metrics` after this alignment, and of `words.SCORES`; (n, 4, 4) each, row by row.
 
     Empty for fewer than 3 rows. `rpe_distance_m` adds the error of the motion between poses this far apart along the
     true path; none is given if the drive is shorter. With `sim3` all figures are of the scaled estimate.

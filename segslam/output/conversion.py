@@ -50,14 +50,15 @@ def convert(
         moved = lidar_from_camera if to == "lidar" else camera_from_lidar
         poses = replace(poses, T_a_b=moved(poses.T_a_b, T_camera_lidar))
     written_as = target_format or _format_of_name(target, poses)
-    if written_as == "kitti":
-        with whole_file(target) as part:
-            write_kitti(part, poses.T_a_b)
-        return len(poses)
-    if poses.stamp_ns is None:
-        raise SegslamError(f"{source}: has no stamps, which {written_as} needs; give KITTI's times.txt with --times")
     with whole_file(target) as part:
-        (write_tum if written_as == "tum" else write_csv)(part, poses.stamp_ns, poses.T_a_b)
+        if written_as == "kitti":
+            write_kitti(part, poses.T_a_b)
+        elif poses.stamp_ns is None:
+            raise SegslamError(
+                f"{source}: has no stamps, which {written_as} needs; give KITTI's times.txt with --times"
+            )
+        else:
+            (write_tum if written_as == "tum" else write_csv)(part, poses.stamp_ns, poses.T_a_b)
     return len(poses)
 
 

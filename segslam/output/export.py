@@ -18,7 +18,7 @@ from segslam.core.whole_files import cannot_write, whole_file
 from segslam.output.finished import read_corrections
 from segslam.output.folder import PLACE_ON_GLOBE, read_localised
 from segslam.output.log import RunLog, read_log
-from segslam.output.map.write import check_files, check_once, write_map
+from segslam.output.map.write import check_files, write_map
 from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.slam_result import TRUSTED_M
 
@@ -68,7 +68,8 @@ def write_maps(
 
         globe = read_globe(folder)
     origin = None if globe is None else globe.origin
-    check_once(files)
+    if twice := [file for file in files if files.count(file) > 1]:
+        raise SegslamError(f"{twice[0]}: given twice; give each file once")
     of_map = [file for file in files if file.name != BEFORE_AFTER and not is_track(file)]
     check_files(of_map, origin=origin)
     with ExitStack() as complete:  # moves each file to its name at the end, after a failure none

@@ -14,63 +14,12 @@ from segslam.core.trajectory import lidar_from_camera, read_poses, rows_of_same_
 from segslam.core.types import LoopAttempt, Motion, SegslamError, Trajectory, Transform
 from segslam.output.folder import ALONE, folder_of, read_alone, read_localised
 from segslam.output.log import RunLog, read_log
+from segslam.output.words import FIGURES
 from segslam.slam.adjustment import Correction, corrections_of, velocities_of
 from segslam.slam.slam import SlamResult
 
 STAMP_TOLERANCE_NS = 10_000_000
 """Largest time difference between a scan and its ground-truth pose."""
-
-FIGURES = {
-    "ate_m": "absolute trajectory error after alignment, rms (m)",
-    "odometry_ate_m": "the same error of the odometry, after repairs by the check (m)",
-    "kiss_icp_ate_m": "the same error of KISS-ICP alone, without repairs and loops (m)",
-    "are_deg": "absolute rotation error after alignment, rms (degrees)",
-    "height_m": "height error after alignment, rms (m)",
-    "rpe_m": "error of the motion from pose to pose, rms (m)",
-    "rpe_deg": "rotation error of the motion from pose to pose, rms (degrees)",
-    "kitti_translation_percent": "KITTI's translation error over 100 to 800 m (%)",
-    "kitti_rotation_deg_per_100m": "KITTI's rotation error over 100 to 800 m (degrees per 100 m)",
-    "num_poses": "poses scored",
-    "length_m": "length of the drive (m)",
-    "duration_s": "duration of the drive (s)",
-    "num_scans": "scans mapped",
-    "num_scans_skipped": "scans skipped (unreadable, empty or without a pose)",
-    "num_scans_left": "scans left when the run was stopped",
-    "num_keyframes": "keyframes",
-    "num_candidates": "loop candidates tried",
-    "num_motions_repaired": "motions of the odometry replaced by registrations",
-    "num_motions_broken": "breaks: motions not supported by the scans",
-    "num_motions_rejected": "motions of the odometry rejected by the optimiser, because loops contradict them",
-    "num_loops_accepted": "loops accepted",
-    "localised_percent": "scans localised in the old map (%)",
-    "num_sessions": "sessions merged",
-    "num_loops_between": "loops between sessions, accepted",
-    "num_loops_between_switched_off": "loops between sessions rejected by the optimiser",
-    "num_loops_switched_off": "accepted loops rejected by the optimiser",
-    "num_loops_false": "false loops: accepted, but wrong by more than 2 m or 5 degrees",
-    "loop_precision": "share of the accepted loops that are correct",
-    "loop_recall": "share of the revisits within 4 m that a correct loop closes",
-    "vertical_deg": "remaining error of the vertical angles; positive: points are too low (degrees)",
-    "vertical_sigma_deg": "standard deviation of this error (degrees)",
-    "vertical_correction_deg": "elevation added to all points for the adjustment and the map (degrees)",
-    "sweep_s": "duration of a sweep; the motion within it is corrected for the adjustment and the map (s; negative: "
-    "clockwise)",
-    "sweep_sigma_s": "standard deviation of this duration (s)",
-    "map_thickness_before_m": "thickness of surfaces in the map before the adjustment (m)",
-    "map_thickness_m": "thickness of surfaces in the map: median standard deviation about local planes (m)",
-    "num_submap_pairs": "pairs of submaps registered for the adjustment",
-    "adjustment_moved_m": "distance by which the adjustment moved keyframes, rms (m)",
-    "num_map_points": "points of the map",
-    "num_map_moving_points": "points removed from the map by class, as moving",
-    "num_map_voxels_seen_through": "voxels removed from the map, because other scans see through them",
-    "map_seconds": "time to write the map (s)",
-    "gnss_kept": "position fixes kept",
-    "gnss_dropped": "position fixes not used: without position, outside of the drive, or contradicted by it",
-    "seconds_total": "total time (s)",
-    "scans_per_second": "scans per second",
-    "peak_rss_mb": "peak memory (MB)",
-}
-"""Meaning of the figures of `metrics.json`, the most important first."""
 
 COMPARED = {"odometry_": "odometry, after repairs", f"{ALONE}_": "KISS-ICP alone"}
 """Prefixes of figures -> the trajectory that they measure, instead of the corrected one."""
@@ -119,9 +68,7 @@ def read_run(folder: str | Path) -> FinishedRun:
         dataset=log.run.get("dataset", ""),
         config=log.config,
         result=replace(
-            result,
-            from_map_m=read_localised(folder, len(result.trajectory)),
-            alone=read_alone(folder, result.odometry),
+            result, from_map_m=read_localised(folder, len(result.trajectory)), alone=read_alone(folder, result.odometry)
         ),
         reference=log.reference(),
         T_camera_lidar=log.T_camera_lidar,

@@ -138,7 +138,6 @@ class OriginCheck(Thread):
         self._socket = listener
         self._inner = inner
         self._loop = asyncio.new_event_loop()
-        self._connections: set[asyncio.Task[None]] = set()
         self._is_closing = asyncio.Event()
         self.start()
 
@@ -157,21 +156,17 @@ class OriginCheck(Thread):
     async def _serve(self) -> None:
         async with await asyncio.start_server(self._connected, sock=self._socket, limit=BLOCK_BYTES):
             await self._is_closing.wait()
-            if self._connections:
-                _, late = await asyncio.wait(self._connections, timeout=END_S)
+            if connections := asyncio.all_tasks() - {asyncio.current_task()}:
+                _, late = await asyncio.wait(connections, timeout=END_S)
                 for task in late:
                     task.cancel()
 
     async def _connected(self, reader: StreamReader, writer: StreamWriter) -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        self._connections.add(task)
         try:
             await self._pass_on(reader, writer)
         except (OSError, EOFError, TimeoutError, asyncio.LimitOverrunError, asyncio.CancelledError):
             writer.transport.abort()  # the viewer has gone, or never was one, or reads no more: nothing is sent to it
         finally:
-            self._connections.discard(task)
             writer.close()
 
     async def _pass_on(self, reader: StreamReader, writer: StreamWriter) -> None:

@@ -10,10 +10,11 @@ from helpers.commands import run
 from helpers.drives import drifting, round_drive
 from helpers.finished_run import make_run
 
-from segslam.cli.tables import SHORT, as_text
+from segslam.cli.tables import as_text
 from segslam.core.trajectory import write_kitti
 from segslam.output.accuracy import scores
 from segslam.output.report import figures
+from segslam.output.words import COLUMNS
 
 TRUTH = round_drive()[1]
 ESTIMATE = drifting(TRUTH).T_world_lidar
@@ -106,8 +107,8 @@ def test_compare_writes_its_table(tmp_path: Path) -> None:
 
 def test_columns_that_do_not_fit_the_terminal_follow_below(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    row = dict.fromkeys(SHORT, 1.25)
+    row = dict.fromkeys(COLUMNS, 1.25)
     text = as_text({"graph.final=consistent": row, "graph.final=none": row})
     assert max(map(len, text.splitlines())) <= 80
-    assert all(title in text for title in SHORT.values())
+    assert all(title in text for title in COLUMNS.values())
     assert text.count("graph.final=none") == text.count("\n\n") + 1 > 1

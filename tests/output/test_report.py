@@ -21,15 +21,16 @@ from PIL import Image
 from segslam import cli
 from segslam.core import geometry
 from segslam.core.config import Config, load_config
-from segslam.core.types import MotionState, SegslamError
+from segslam.core.types import MotionState, RejectReason, SegslamError
 from segslam.output.accuracy import accuracy
-from segslam.output.finished import FIGURES, FinishedRun, read_run
+from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import ALONE, write_metrics, write_poses
 from segslam.output.map.from_above import small_png
 from segslam.output.report import figures, loops, write_report
 from segslam.output.report.figures import draw_loops, paths_of
 from segslam.output.report.loops import choose
 from segslam.output.report.page import number, page, settings_not_default
+from segslam.output.words import FIGURES, REASONS
 from segslam.slam.slam_result import outcome_text
 
 VOID = {"meta", "img", "wbr"}
@@ -172,6 +173,10 @@ def test_every_figure_is_in_the_table_with_its_meaning(scored: Path) -> None:
             assert f"<code>{key}</code>" in html.replace("<wbr>", "")
     assert number(metrics["odometry_ate_m"]) in html
     assert FIGURES["ate_m"] in html
+
+
+def test_every_reason_has_a_meaning() -> None:
+    assert set(REASONS) == set(RejectReason)
 
 
 def test_changed_settings_are_marked_and_shown_open(tmp_path: Path) -> None:

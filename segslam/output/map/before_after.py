@@ -26,15 +26,7 @@ from segslam.core.types import (
     Transform,
     Vector,
 )
-from segslam.output.map.from_above import (
-    Window,
-    cut_heights,
-    draw_path,
-    free_heights,
-    png,
-    scale_bar,
-    visible,
-)
+from segslam.output.map.from_above import Window, cut_heights, draw_path, free_heights, png, scale_bar, visible
 
 MOST_PIXELS = 900
 """Chosen: largest number of pixels along the longer side of a panel."""

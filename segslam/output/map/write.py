@@ -75,18 +75,10 @@ def _check_packages(file: Path, needs: str, packages: Sequence[str], *, extra: s
 
 
 def check_files(files: Sequence[Path], *, origin: "Origin | None" = None) -> None:
-    """Raises SegslamError as `check_names`, for a file that cannot be written, or for one that is given twice."""
+    """Raises SegslamError as `check_names`, and for a file that cannot be written."""
     check_names(files, origin=origin)
-    check_once(files)
     for file in files:
         check_target(file)
-
-
-def check_once(files: Sequence[Path]) -> None:
-    """Raises SegslamError for a file that is given twice."""
-    for file in files:
-        if files.count(file) > 1:
-            raise SegslamError(f"{file}: given twice; give each file once")
 
 
 def write_map(

@@ -9,12 +9,13 @@ import matplotlib
 
 from segslam.core.processes import in_parts
 from segslam.core.whole_files import write_whole
-from segslam.output.finished import FIGURES, FinishedRun, read_run
+from segslam.output.finished import FinishedRun, read_run
 from segslam.output.log import read_log
 from segslam.output.map.before_after import BeforeAfter
 from segslam.output.map.from_above import small_png
 from segslam.output.report import figures, loops
 from segslam.output.report.page import loops_section, number, page, picture_section, section
+from segslam.output.words import FIGURES
 
 __all__ = ["BEFORE_AFTER", "draw_before_after", "write_report"]
 

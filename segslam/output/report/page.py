@@ -4,71 +4,14 @@ import base64
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from html import escape
+from importlib import resources
 from typing import Any
 
 from segslam.core.config import Config, changed_settings
 from segslam.core.types import Rejected
-from segslam.output.finished import COMPARED, FIGURES, FinishedRun, plain_name
-from segslam.output.words import REASONS, WORDS
+from segslam.output.finished import COMPARED, FinishedRun, plain_name
+from segslam.output.words import CONDITIONS, FIGURES, FILES, REASONS, WORDS
 from segslam.slam.adjustment.vertical_angle import vertical_angle_advice
-
-FILES = {
-    "map.png": "the map in top view",
-    "map.ply": "the map as a point cloud",
-    "before_after.png": "the map by odometry beside the corrected map",
-    "poses_tum.txt": "pose of every scan, TUM format, LiDAR frame",
-    "poses_kitti.txt": "pose of every scan, KITTI format",
-    "odometry_tum.txt": "the same before loop closing, TUM format",
-    "odometry_kitti.txt": "the same before loop closing, KITTI format",
-    "kiss_icp_tum.txt": "the same by KISS-ICP alone, TUM format",
-    "kiss_icp_kitti.txt": "the same by KISS-ICP alone, KITTI format",
-    "georeference.json": "place of the map on the globe",
-    "gnss.csv": "position fixes: kept, or why not",
-    "poses_geodetic.csv": "latitude, longitude, height and heading of every scan",
-    "poses_enu_tum.txt": "pose of every scan, east, north and up, TUM format",
-    "loops.csv": 'all loop candidates and their outcomes (<a href="#words">words</a>)',
-    "graph.g2o": "the pose graph",
-    "adjusted.g2o": "all edges of the last estimate, as <code>segslam georeference</code> reads them",
-    "metrics.json": "the figures of this page",
-    "config.yaml": "the settings",
-    "log.mcap": "complete log, for Foxglove and segslam replay",
-}
-CONDITIONS = {
-    "started": "started (UTC)",
-    "command": "command",
-    "segslam": "segslam",
-    "processor": "processor",
-    "platform": "system",
-    "python": "Python",
-}
-"""Key in the log -> text on the page."""
-STYLE = """
-:root { color-scheme: light; --line: #d8dee4; --soft: #57606a; }
-body { margin: 0 auto; max-width: 76rem; padding: 1rem; font: 16px/1.45 system-ui, sans-serif; color: #1f2328; }
-h1 { font-size: 1.5rem; margin: 0 0 .2rem; } h2 { font-size: 1.1rem; margin: 0 0 .4rem; }
-.soft { color: var(--soft); } .plots { columns: 2 30rem; column-gap: 1rem; margin-bottom: 1rem; }
-.tiles { display: grid; gap: 1rem; margin: 1rem 0; grid-template-columns: repeat(auto-fit, minmax(9rem, 1fr)); }
-section { margin-bottom: 1rem; break-inside: avoid; min-width: 0; overflow-x: auto; }
-.tiles div, section { border: 1px solid var(--line); border-radius: .5rem; padding: .7rem .9rem; background: #fff; }
-.tiles b { display: block; font-size: 1.4rem; } img { width: 100%; height: auto; display: block; }
-table { border-collapse: collapse; width: 100%; font-size: .92rem; }
-td, th { text-align: left; padding: .2rem .6rem .2rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
-#pair { display: flex; flex-wrap: wrap; gap: 1rem; } #pair h3 { flex-basis: 100%; margin: .5rem 0 0; font-size: 1rem; }
-#pair h4 { margin: 0; text-align: center; }
-.panel { flex: 1 1 18rem; min-width: 0; } figure { margin: 0; min-width: 0; overflow-x: auto; }
-.gallery { display: grid; gap: 1rem;
-  grid-template-columns: repeat(auto-fit, minmax(min(34rem, 100%), 1fr)); } p { margin: .2rem 0 .6rem; }
-td.number, th + th { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
-th + th { white-space: normal; width: 5.5rem; }
-tr.changed td { font-weight: 600; background: #fff8e1; } code { font-size: .9em; overflow-wrap: break-word; }
-details { margin: .3rem 0; } summary { cursor: pointer; } details td:first-child { white-space: nowrap; }
-@media (max-width: 40rem) { body, section { padding: .5rem; } td code { display: block; }
-  th + th { width: 1px; } img[src*="image/png"] { width: 44rem; } }
-@media print { body { max-width: none; padding: 0; font-size: 11px; } .plots { columns: 2 7cm; }
-  .tiles div, tr, img { break-inside: avoid; } h2, summary { break-after: avoid; }
-  section:has(details) { break-inside: auto; }
-  details::details-content { content-visibility: visible; height: auto; } }
-"""
 
 
 def page(run: FinishedRun, plots: Mapping[str, str], *, top: str, gallery: str, about: Mapping[str, str]) -> str:
@@ -117,10 +60,11 @@ def settings_not_default(config: Config) -> str:
 
 def document(title: str, body: str) -> str:
     """A whole HTML file in the style of all reports."""
+    style = resources.files("segslam.output.report").joinpath("style.css").read_text(encoding="utf-8")
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{STYLE}</style></head>\n<body><h1>{escape(title)}</h1>"
+        f"<title>{escape(title)}</title><style>\n{style}</style></head>\n<body><h1>{escape(title)}</h1>"
         f"{body}</body></html>\n"
     )
 
@@ -178,7 +122,7 @@ def _outcomes(run: FinishedRun) -> str:
         return f"<p>No pair of keyframes was proposed as a loop.</p>{words}"
     outcomes = (attempt.outcome for attempt in run.result.attempts)
     names = Counter(outcome.reason.value if isinstance(outcome, Rejected) else "accepted" for outcome in outcomes)
-    meanings = {reason.value: f'<div class="soft">{meaning}</div>' for reason, meaning in REASONS.items()}
+    meanings = {reason: f'<div class="soft">{meaning}</div>' for reason, meaning in REASONS.items()}
     rows = ((f"{name.replace('_', ' ')}{meanings.get(name, '')}", count) for name, count in names.most_common())
     return table(rows, head=("", "attempts")) + words
 

@@ -40,6 +40,8 @@ def test_register_prints_the_pose_as_json(
     assert geometry.distance(geometry.inverse(T_target_source) @ found) < (0.05 if refine else 0.3)
     assert {"describe_source", "describe_target", "match"} <= set(figures["seconds"])
     assert ("refine" in figures["seconds"]) == refine
+    assert figures["num_inliers"] >= 3
+    assert figures["overlap"] > 0.5 if refine else figures["overlap"] is None
 
 
 def test_a_rejection_has_a_reason_one_line_and_exit_status_1(

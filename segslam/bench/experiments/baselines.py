@@ -38,10 +38,10 @@ class Estimate:
     num_inliers: int | None = None
     num_edges: int | None = None
     """Number of edges of the consistency graph."""
+    overlap: float | None = None
+    """As that of `segslam.core.types.Alignment`, and the next two."""
     probability: float | None = None
-    """That the pose is right."""
     evidence: dict[str, float] | None = None
-    """As that of `segslam.core.types.Alignment`."""
 
 
 class GicpScan:

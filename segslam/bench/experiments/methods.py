@@ -108,7 +108,7 @@ def _align(source: Values, target: Values, config: Config, watch: Stopwatch) -> 
     found = registration.register_prepared(*scans, config=config, watch=watch)
     if isinstance(found, Alignment):
         estimate = _estimate(found.coarse, found.fine)
-        return replace(estimate, probability=found.probability, evidence=found.evidence)
+        return replace(estimate, overlap=found.overlap, probability=found.probability, evidence=found.evidence)
     return found
 
 

@@ -77,8 +77,8 @@ def read_returns(file: Path) -> Float32[np.ndarray, "_ 4"]:
     values = np.frombuffer(content[: len(content) // 4 * 4], dtype="<f4")
     if (num := _values_per_point(values)) != 4:
         raise BadScan(
-            f"{file}: does not have 4 values per point (x y z intensity) but {num}; if x y z come first, convert it, in "
-            f"Python: numpy.save('NAME.npy', numpy.fromfile('NAME.bin', '<f4').reshape(-1, {num}))"
+            f"{file}: does not have 4 values per point (x y z intensity) but {num}; if x y z come first, convert it "
+            f"in Python: numpy.save('NAME.npy', numpy.fromfile('NAME.bin', '<f4').reshape(-1, {num}))"
         )
     if len(content) % 16:
         raise BadScan(

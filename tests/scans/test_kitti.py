@@ -162,7 +162,8 @@ def test_the_values_per_point_of_real_scans_are_found(
         elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
         ring = np.round(40.0 * (elevation - elevation.min()))
         share = points[:, 3] / max(points[:, 3].max(), 1.0)
-        columns = [points[:, :3], scale * share, ring, np.linspace(0.0, 0.1, len(points)), rng.uniform(size=len(points))]
+        times, last = np.linspace(0.0, 0.1, len(points)), rng.uniform(size=len(points))
+        columns = [points[:, :3], scale * share, ring, times, last]
         np.column_stack(columns)[:, :num].astype("<f4").tofile(file)
         if num == 4:
             assert len(read_returns(file)) == len(points)

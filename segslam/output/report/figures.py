@@ -126,7 +126,7 @@ def draw_loops_over_time(run: FinishedRun) -> str:
 
 
 def draw_errors(run: FinishedRun) -> str | None:
-    """Errors of position and height against travel, after the alignment of the ATE; None with fewer than 2 true poses."""
+    """Errors of position and height against travel, after the alignment of the ATE; None below 2 true poses."""
     if (true := true_scans(run)) is None or len(true[0]) < 2:
         return None
     rows, truth = true

@@ -1,7 +1,7 @@
 """Fixes from a CSV file: time, latitude, longitude, height, standard deviations.
 
 With a header the columns may be in any order and have one of several common names; without one they are in the order
-above. Separators are commas, semicolons, tabs or blanks; text after # is ignored.
+above. Separators are semicolons (then decimal commas are read), commas, tabs or blanks; text after # is ignored.
 """
 
 import re
@@ -71,9 +71,9 @@ def read_csv(file: Path, lines: Sequence[str]) -> list[Row]:
 
 
 def _cells(line: str) -> list[str]:
-    for separator in (",", ";", "\t"):
-        if separator in line:
-            return [cell.strip().strip('"') for cell in line.split(separator)]
+    for separator in (";", ",", "\t"):
+        if separator in line:  # a comma that is left is a decimal one
+            return [cell.strip().strip('"').replace(",", ".") for cell in line.split(separator)]
     return line.split()
 
 

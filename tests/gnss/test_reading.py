@@ -403,6 +403,13 @@ def test_rostopic_echo_p_is_read_by_its_names(tmp_path: Path) -> None:
     assert fixes.reasons == ("", "no_fix")
 
 
+def test_numbers_between_semicolons_may_have_decimal_commas(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("time;lat;lon;alt\n1,5;48,25;11,5;500,5\n2,5;48,5;11,5;501\n")
+    fixes = read_fixes(tmp_path / "a.csv")
+    assert fixes.stamp_ns.tolist() == [1_500_000_000, 2_500_000_000]
+    assert fixes.places.tolist() == [[48.25, 11.5, 500.5], [48.5, 11.5, 501.0]]
+
+
 def test_a_recording_may_end_in_capitals(tmp_path: Path) -> None:
     assert len(read_fixes(write_mcap(tmp_path / "DRIVE.MCAP"))) == 3
 

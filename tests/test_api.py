@@ -160,6 +160,7 @@ WRONG_KINDS = {
     "segslam.merge(['.'], 'run', config=5)": "5 is not a Config",
     "segslam.merge('.', 'run')": "1 run given",
     "segslam.register(np.ones((3, 3)), np.ones((3, 3)), config='x.yaml')": "x.yaml is not a Config",
+    "segslam.load_config(5)": "5: not a path",
     "segslam.open_dataset('.', frames=5)": "frames 5: give a text, 'A:B'",
     "segslam.fleet(['.'], 'fleet', num_workers=0)": "num_workers=0",
     "segslam.Scan(np.ones((5, 3)), 0.5)": "stamp_ns 0.5: give integer nanoseconds",

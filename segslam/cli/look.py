@@ -11,6 +11,7 @@ from segslam.cli.ending import counted
 from segslam.cli.options import LogArgument, OverwriteOption
 from segslam.cli.tables import with_meanings
 from segslam.cli.viewers import check_display, scene_in
+from segslam.core.errors import SegslamError
 
 if TYPE_CHECKING:
     from segslam.output.log import RunLog
@@ -49,6 +50,8 @@ def view(
     """
     if save is None:
         check_display()
+    elif save.suffix.lower() not in ("", ".rrd"):
+        raise SegslamError(f"--save {save}: Rerun's files end in .rrd; for other formats of the map: segslam export")
     check_free([save], overwrite=overwrite)
     terminal.announce(f"view: reading {run}")
     from segslam.core.whole_files import whole_file

@@ -70,11 +70,12 @@ class Rows:
 def read_poses(path: Path, *, format: PoseFormat | None = None, skips_names: bool = False) -> PoseFile:
     """The poses of a KITTI or TUM file with exact rotations; by default the format is detected from the columns.
 
-    Empty lines, text after a #, and with `skips_names` a first line of column names, are ignored. Raises SegslamError,
-    naming the file and line, for another number of columns, numbers that are not finite, and matrices or quaternions
-    that are not rotations.
+    Empty lines, text after a #, and a first line of column names (of a .csv file, or with `skips_names`) are ignored.
+    Raises SegslamError, naming the file and line, for another number of columns, numbers that are not finite, and
+    matrices or quaternions that are not rotations.
     """
     lines = _number_lines(path)
+    skips_names = skips_names or path.suffix.lower() == ".csv"
     if skips_names and len(lines) > 1 and not re.match(r"[-+.\d]", lines[0][1][0]):
         number, names = lines[0]
         if any(name.lower().endswith("w") for name in names[4:-1]):

@@ -11,11 +11,13 @@ from segslam.core.interrupts import removed_when_stopped
 
 
 def expanded(path: str | Path) -> Path:
-    """The path with the home folder in place of `~`. Raises SegslamError for a user who does not exist."""
+    """The path with the home folder in place of `~`. Raises SegslamError for a user who does not exist, and no path."""
     try:
         return Path(path).expanduser()
     except RuntimeError as error:
         raise SegslamError(f"{brief(str(path))}: there is no user with this name; write the folder in full") from error
+    except TypeError as error:
+        raise SegslamError(f"{brief(repr(path))}: not a path; give a text or a Path") from error
 
 
 def read_text(path: Path, content: str, remedy: str) -> str:

@@ -1,7 +1,7 @@
 """Fixes from a CSV file: time, latitude, longitude, height, standard deviations.
 
 With a header the columns may be in any order and have one of several common names; without one they are in the order
-above. Separators are commas, semicolons, tabs or blanks; text after # is ignored.
+above. Separators are semicolons (then decimal commas are read), commas, tabs or blanks; text after # is ignored.
 """
 
 import re
@@ -17,7 +17,20 @@ from segslam.core.types import SegslamError
 from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
 
 COLUMNS: dict[str, tuple[str, ...]] = {
-    "time": ("time", "t", "seconds", "timestamp", "stamp", "stamp_s", "time_s", "sec", "secs", "utc", "unix_time"),
+    "time": (
+        "header_stamp",
+        "time",
+        "t",
+        "seconds",
+        "timestamp",
+        "stamp",
+        "stamp_s",
+        "time_s",
+        "sec",
+        "secs",
+        "utc",
+        "unix_time",
+    ),
     "time_ns": ("time_ns", "stamp_ns", "timestamp_ns", "nanoseconds"),
     "fraction_ns": ("nanosec", "nanosecs", "nsec", "nsecs"),
     "latitude": ("latitude", "latitude_deg", "lat", "lat_deg"),
@@ -27,7 +40,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "sigma_north": ("sigma_north", "sigma_north_m", "sd_north", "sdn", "std_lat", "sigma_n", "sigma_y"),
     "sigma_up": ("sigma_up", "sigma_up_m", "sd_up", "sdu", "std_alt", "sigma_u", "sigma_z", "vertical_accuracy"),
     "sigma": ("sigma", "sigma_m", "accuracy", "horizontal_accuracy", "hacc", "std", "sd"),
-    "status": ("status",),
+    "status": ("status", "status_status"),
     "quality": ("quality", "fix", "valid"),
 }
 ORDER = ("time", "latitude", "longitude", "height", "sigma_east", "sigma_north", "sigma_up")
@@ -58,15 +71,15 @@ def read_csv(file: Path, lines: Sequence[str]) -> list[Row]:
 
 
 def _cells(line: str) -> list[str]:
-    for separator in (",", ";", "\t"):
-        if separator in line:
-            return [cell.strip().strip('"') for cell in line.split(separator)]
+    for separator in (";", ",", "\t"):
+        if separator in line:  # a comma that is left is a decimal one
+            return [cell.strip().strip('"').replace(",", ".") for cell in line.split(separator)]
     return line.split()
 
 
 def _places_by_name(file: Path, number: int, names: Sequence[str]) -> dict[str, int]:
     cleaned = [
-        re.sub(r"[^a-z0-9_]", "", re.sub(r"[\[(].*", "", name.lower().strip()).strip().replace(" ", "_"))
+        re.sub(r"[^a-z0-9_]", "", re.sub(r"[\[(].*|^field\.", "", name.lower()).strip().translate({32: "_", 46: "_"}))
         for name in names
     ]
     places = {

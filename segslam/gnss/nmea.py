@@ -14,17 +14,20 @@ from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
 
 def is_nmea(lines: Sequence[str]) -> bool:
     """True if one of the first lines is a sentence."""
-    return any(re.match(r"\s*\$..(GGA|RMC|GSA|GSV|ZDA)", line) for line in lines[:50])
+    return any(re.search(r"\$..(GGA|RMC|GSA|GSV|ZDA)", line) for line in lines[:50])
 
 
 def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
     """The fixes of all talkers, and a note about their heights; GGA where there is any, else RMC.
 
-    Lines with a wrong checksum are left out. Raises SegslamError, naming file and line, if all are wrong, or for a
+    Text before the $ is ignored, such as the time of the computer. Lines with a wrong checksum are left out, and those
+    without one, unless no line has any. Raises SegslamError, naming file and line, if all are wrong, or for a
     position with a right checksum that is none.
     """
     found: dict[str, list[Row]] = {"GGA": [], "RMC": []}
-    all_words = {number: _words(line) for number, line in enumerate(lines, 1) if line.lstrip().startswith("$")}
+    contents = {number: line.partition("$")[2].strip() for number, line in enumerate(lines, 1) if "$" in line}
+    is_checked = any("*" in content for content in contents.values())
+    all_words = {number: _words(content) if is_checked else content.split(",") for number, content in contents.items()}
     sentences = {number: words for number, words in all_words.items() if words}
     num_wrong = len(all_words) - len(sentences)
     if not sentences:
@@ -45,6 +48,7 @@ def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
         last = at
         found[kind].append(_row(file, number, kind, words, datetime.combine(day, at, tzinfo=UTC)))
     left_out = f"; {num_wrong} lines with wrong checksums left out" if num_wrong else ""
+    left_out += "" if is_checked else "; no line has a checksum"
     if not found["GGA"]:
         return found["RMC"], f"no heights{left_out}"
     heights = "altitude above the geoid and geoid separation, as the receiver gives them, added to ellipsoidal heights"
@@ -62,9 +66,9 @@ def _midnights_before_date(file: Path, sentences: Mapping[int, Sequence[str]]) -
     return timedelta()
 
 
-def _words(line: str) -> list[str] | None:
-    """The fields of a sentence; None if its checksum is wrong or missing."""
-    content, star, checksum = line.strip().removeprefix("$").rpartition("*")
+def _words(sentence: str) -> list[str] | None:
+    """The fields of a sentence after its $; None if its checksum is wrong or missing."""
+    content, star, checksum = sentence.rpartition("*")
     total = reduce(xor, content.encode(errors="replace"), 0)
     return content.split(",") if star and checksum.upper() == f"{total:02X}" else None
 

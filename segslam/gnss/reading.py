@@ -57,7 +57,7 @@ def _read_messages(recording: Path, topic: str) -> list[Row]:
     """
     from segslam.scans.messages import BagMessages, McapMessages
 
-    read = McapMessages if recording.suffix == ".mcap" else BagMessages
+    read = McapMessages if recording.suffix.lower() == ".mcap" else BagMessages
     try:
         messages = read(recording, topic, kind="sensor_msgs/msg/NavSatFix", option="--gnss")
         return [row_of(messages[number][1]) for number in range(len(messages))]

@@ -26,7 +26,7 @@ AHEAD_OF_UTC = {"UTC": timedelta(0), "JST": timedelta(hours=9)}
 
 def is_rtklib(lines: Sequence[str]) -> bool:
     """True if the header names the columns of a solution."""
-    return any(line.startswith("%") and ("latitude" in line or "x-ecef" in line) for line in lines[:100])
+    return any(line.startswith("%") and ("latitude(" in line or "x-ecef" in line) for line in lines[:100])
 
 
 def read_rtklib(file: Path, lines: Sequence[str]) -> list[Row]:
@@ -34,7 +34,7 @@ def read_rtklib(file: Path, lines: Sequence[str]) -> list[Row]:
     rows, is_ecef, is_in_parts, clock = [], False, False, "GPST"
     for number, line in enumerate(lines, 1):
         if line.startswith("%"):
-            if "latitude" in line or "x-ecef" in line:
+            if "latitude(" in line or "x-ecef" in line:
                 is_ecef, is_in_parts = "x-ecef" in line, "(d'" in line
                 clock = next((name for name in AHEAD_OF_UTC if name in line.lstrip("% ").split()[:1]), "GPST")
             continue

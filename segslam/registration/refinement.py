@@ -111,7 +111,7 @@ class LightSurface:
 
     def __init__(self, thinned: Points) -> None:
         self.points = np.ascontiguousarray(thinned, dtype=np.float64)
-        self._tree = small_gicp.KdTree(self.points)
+        self._tree = _tree_of(self.points)
         self._normals = np.zeros_like(self.points)
         self._has_normal = np.zeros(len(thinned), dtype=bool)
 
@@ -143,7 +143,7 @@ def downsample(points: Points, *, config: RefineConfig) -> Points:
 def make_surface(downsampled: Points, *, config: RefineConfig) -> Surface:
     """The surface through downsampled points. It may be empty; `refine` then rejects."""
     cloud = small_gicp.PointCloud(downsampled.astype(np.float64))
-    tree = small_gicp.KdTree(cloud)
+    tree = _tree_of(cloud)
     if len(downsampled) < MIN_POINTS:
         return Surface(cloud, tree, LEAST_ROUGHNESS * config.voxel_m)
     small_gicp.estimate_normals_covariances(cloud, tree, NUM_NEIGHBOURS, 1)
@@ -157,6 +157,11 @@ def sparse(surface: Surface, *, config: RefineConfig) -> Surface:
     """
     points = small_gicp.voxelgrid_sampling(surface.points, SPARSE_VOXELS * config.voxel_m, 1).points()[:, :3]
     return make_surface(points, config=config) if len(points) >= LEAST_SPARSE else surface
+
+
+def _tree_of(points: Any) -> Any:
+    """The search tree of an array or cloud; None of no points: small_gicp warns, and a search ends the program."""
+    return small_gicp.KdTree(points) if len(points) else None
 
 
 def _roughness(cloud: Any, tree: Any, voxel_m: float) -> float:

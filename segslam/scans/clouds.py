@@ -25,7 +25,7 @@ def read_file(file: Path) -> Cloud:
     Raises SegslamError, naming the file: BadScan for one that is missing, invalid, truncated or too large.
     """
     try:
-        match file.suffix:
+        match file.suffix.lower():
             case ".bin":
                 return _from_rows(read_returns(file))
             case ".npy":

@@ -21,10 +21,8 @@ from segslam.scans.scan_files import read_bytes
 
 VERTICAL_ANGLE_DEG = 0.205
 """Angle by which the points of KITTI's scans are too low; value of KISS-ICP (Vizzo et al., RA-L 2023)."""
-EVERY = (101, 11)  # primes: the sampled rows start equally often at each of 3 or 5 columns
-FEWEST_COMPARED = 300
-ALIKE = 0.15
-"""Chosen: largest difference of quantiles, as a share of their range, between 300 samples of one distribution."""
+FEWEST_COMPARED, MOST_COMPARED = 1_200, 100_000
+"""Values of a file from which the number per point is found: 300 points at least; more than 100,000 only take time."""
 LIDAR_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
 """Names of T_camera_lidar in calib.txt, in KITTI's odometry, object and tracking benchmarks."""
 
@@ -76,33 +74,39 @@ def is_kitti(data: Path) -> bool:
 def read_returns(file: Path) -> Float32[np.ndarray, "_ 4"]:
     """(n, 4) x, y, z, intensity of a velodyne file, as stored. Raises BadScan if it is invalid."""
     content = read_bytes(file)
+    values = np.frombuffer(content[: len(content) // 4 * 4], dtype="<f4")
+    if (num := _values_per_point(values)) != 4:
+        raise BadScan(
+            f"{file}: does not have 4 values per point (x y z intensity) but {num}; if x y z come first, convert it "
+            f"in Python: numpy.save('NAME.npy', numpy.fromfile('NAME.bin', '<f4').reshape(-1, {num}))"
+        )
     if len(content) % 16:
         raise BadScan(
             f"{file}: {len(content)} bytes are not a multiple of 16 (float32 x y z intensity): truncated, or not 4 "
             "values per point; copy the file again, or convert it"
         )
-    returns = np.frombuffer(content, dtype="<f4").reshape(-1, 4)
-    if _mixes_columns(returns):
-        raise BadScan(
-            f"{file}: its four columns have the same distribution, so it does not have 4 values per point (x y z "
-            "intensity) but, for example, x y z; convert it, for example to .ply"
-        )
-    return returns
+    return values.reshape(-1, 4)
 
 
-def _mixes_columns(returns: Float32[np.ndarray, "_ 4"]) -> bool:
-    """True if the file has 3 or 5 values per point: each value then occurs in every column in turn."""
-    for every in EVERY:
-        some = returns[::every]
-        some = some[np.isfinite(some).all(axis=1)]
-        if len(some) >= FEWEST_COMPARED:
-            break
-    else:
-        return False
-    shares = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
-    levels = np.sort(some, axis=0)[(shares * len(some)).astype(int)]
-    spread = np.ptp(levels)
-    return bool(spread > 0 and np.ptp(levels, axis=1).max() < ALIKE * spread)
+def _values_per_point(values: Float32[np.ndarray, " _"]) -> int:
+    """The distance in the file, 3 to 7, at which values differ least in the mean; 4 for a file of few values.
+
+    At a multiple of the number per point both values are of one column. In any order of the points their mean
+    difference is then smallest: the energy distance of distributions is not negative (Szekely and Rizzo 2013).
+    """
+    if len(values) < FEWEST_COMPARED:
+        return 4
+    some = np.nan_to_num(values[:MOST_COMPARED], posinf=0.0, neginf=0.0)
+    with np.errstate(over="ignore"):
+        differences = {
+            num: float(np.abs(some[num:] - some[:-num]).mean(dtype=float))
+            for num in (4, 3, 5, 6, 7)
+            if num == 4 or len(values) % num == 0
+        }
+    num = min(differences, key=differences.__getitem__)
+    of_two_columns = min(differences[other] for other in differences if other % 3)
+    is_multiple = num == 6 and 2.0 * differences[3] < differences[6] + of_two_columns
+    return 3 if is_multiple else num
 
 
 def read_calibration(file: Path) -> Transform:

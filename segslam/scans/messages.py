@@ -140,9 +140,10 @@ class McapMessages:
             summary = _summary(stream)
             assert summary.statistics is not None
             known = [one for one in summary.channels.values() if one.schema_id]
-            if any(one.schema_id not in summary.schemas for one in known):
-                raise ValueError(DAMAGED_INDEX)
-            alike = [one for one in known if summary.schemas[one.schema_id].name == kind]
+            if not summary.channels or any(one.schema_id not in summary.schemas for one in known):
+                raise ValueError("its index lacks channels or schemas; `mcap recover` adds them")
+            names = (kind, kind.replace("/msg/", "/"))  # of ROS 2, and of ROS 1
+            alike = [one for one in known if summary.schemas[one.schema_id].name in names]
             self._topic = one_topic(file, {one.topic for one in alike}, topic, kind=kind, option=option)
             channels = {one.id: one for one in alike if one.topic == self._topic}
             counts = summary.statistics.channel_message_counts
@@ -150,9 +151,13 @@ class McapMessages:
             self._places = _places(stream, summary, channels)
         self._decode: dict[int, Callable[[bytes], Any]] = {}
         for id, one in channels.items():
-            decode = DecoderFactory().decoder_for(one.message_encoding, summary.schemas[one.schema_id])
+            schema = summary.schemas[one.schema_id]
+            decode = DecoderFactory().decoder_for(one.message_encoding, schema)
             if decode is None:
-                raise ValueError(f"messages on {one.topic} are encoded as {one.message_encoding}, not as ROS 2's cdr")
+                raise SegslamError(
+                    f"{file}: messages on {one.topic} are encoded as {one.message_encoding} ({schema.encoding}), not "
+                    "as ROS 2's cdr (ros2msg); give the bag of ROS 1, or convert it to ROS 2"
+                )
             self._decode[id] = decode
         self._in_order = None
         if len(self._places) != self._num_messages:

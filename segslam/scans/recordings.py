@@ -127,10 +127,11 @@ def scan_files(folder: Path) -> list[Path]:
 
     Raises SegslamError for scans of several formats.
     """
-    found = [file for file in folder.iterdir() if file.suffix in SUFFIXES and not file.name.startswith(".")]
+    found = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
     files = [file for file in found if file.is_file()]
-    files = [file for file in files if file.suffix != ".npy"] or files
-    counts = {suffix: sum(file.suffix == suffix for file in files) for suffix in sorted({f.suffix for f in files})}
+    files = [file for file in files if file.suffix.lower() != ".npy"] or files
+    suffixes = [file.suffix.lower() for file in files]
+    counts = {suffix: suffixes.count(suffix) for suffix in sorted(set(suffixes))}
     if len(counts) > 1:
         listed = ", ".join(f"{suffix} {count}" for suffix, count in counts.items())
         raise SegslamError(f"{folder}: {len(counts)} kinds of scans ({listed}); put each kind into its own folder")
@@ -198,8 +199,8 @@ def _loader(kind: str, source: Path, sequence: str, topic: str) -> Any:
 
 
 def _kind_of(data: Path) -> str:
-    if data.is_file() and data.suffix in KIND_OF_SUFFIX:
-        return KIND_OF_SUFFIX[data.suffix]
+    if data.is_file() and (suffix := data.suffix.lower()) in KIND_OF_SUFFIX:
+        return KIND_OF_SUFFIX[suffix]
     if (data / "metadata.yaml").exists() or any(data.glob("*.bag")):
         return "rosbag"
     if data.is_dir() and scan_files(_scans_folder(data)):

@@ -67,6 +67,15 @@ def test_comments_blank_lines_commas_and_a_byte_order_mark_are_read_over(tmp_pat
     np.testing.assert_allclose(read.T_a_b[:, :3, 3], [[1, 2, 3], [4, 5, 6]])
 
 
+def test_a_line_of_column_names_is_read_over_in_csv_alone(tmp_path: Path) -> None:
+    text = "timestamp,x,y,z,qx,qy,qz,qw\n1.5,1,2,3,0,0,0,1\n"
+    (tmp_path / "a.CSV").write_text(text)
+    assert trajectory.read_poses(tmp_path / "a.CSV").T_a_b[0, :3, 3].tolist() == [1.0, 2.0, 3.0]
+    (tmp_path / "a.txt").write_text(text)
+    with pytest.raises(SegslamError, match=r"a\.txt:1: "):
+        trajectory.read_poses(tmp_path / "a.txt")
+
+
 @pytest.mark.parametrize(
     ("line", "complaint"),
     [

@@ -378,6 +378,42 @@ def test_blanks_before_a_sentence_are_ignored(tmp_path: Path) -> None:
     assert read_fixes(tmp_path / "a.log").places.tolist() == [[48.0, 8.0, 148.0]]
 
 
+@pytest.mark.parametrize("before", ["", "1700000000.25 ", "2024-01-01 23:59:58,100: "])
+@pytest.mark.parametrize("has_checksums", [True, False])
+def test_sentences_after_a_host_time_and_without_checksums_are_read(
+    before: str, has_checksums: bool, tmp_path: Path
+) -> None:
+    contents = [f"GPGGA,23595{row}.00,480{row}.0,N,00800.0,E,1,8,1,100,M,48,M,," for row in range(3)]
+    lines = [sentence(content) if has_checksums else f"${content}" for content in contents]
+    (tmp_path / "a.log").write_text("".join(f"{before}{line}\r\n" for line in lines))
+    fixes = read_fixes(tmp_path / "a.log")
+    np.testing.assert_allclose(fixes.places, [[48.0 + row / 60.0, 8.0, 148.0] for row in range(3)])
+    assert ("no line has a checksum" in fixes.note) == (not has_checksums)
+
+
+def test_rostopic_echo_p_is_read_by_its_names(tmp_path: Path) -> None:
+    names = "%time,field.header.seq,field.header.stamp,field.header.frame_id,field.status.status,field.status.service,"
+    names += "field.latitude,field.longitude,field.altitude,field.position_covariance0,field.position_covariance_type"
+    rows = ["1500000000300000000,1,1500000000100000000,gps,0,1,48.1,11.5,500.5,1.0,2"]
+    rows += ["1500000001300000000,2,1500000001100000000,gps,-1,1,48.2,11.6,501.5,1.0,2"]
+    (tmp_path / "fix.csv").write_text("\n".join([names, *rows]) + "\n")
+    fixes = read_fixes(tmp_path / "fix.csv")
+    assert fixes.stamp_ns.tolist() == [1500000000100000000, 1500000001100000000]
+    assert fixes.places.tolist() == [[48.1, 11.5, 500.5], [48.2, 11.6, 501.5]]
+    assert fixes.reasons == ("", "no_fix")
+
+
+def test_numbers_between_semicolons_may_have_decimal_commas(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("time;lat;lon;alt\n1,5;48,25;11,5;500,5\n2,5;48,5;11,5;501\n")
+    fixes = read_fixes(tmp_path / "a.csv")
+    assert fixes.stamp_ns.tolist() == [1_500_000_000, 2_500_000_000]
+    assert fixes.places.tolist() == [[48.25, 11.5, 500.5], [48.5, 11.5, 501.0]]
+
+
+def test_a_recording_may_end_in_capitals(tmp_path: Path) -> None:
+    assert len(read_fixes(write_mcap(tmp_path / "DRIVE.MCAP"))) == 3
+
+
 def test_the_home_of_an_unknown_user_is_refused() -> None:
     with pytest.raises(SegslamError, match="there is no user with this name"):
         read_fixes("~unknown-user/fixes.csv")

@@ -6,7 +6,7 @@ import shutil
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from html.parser import HTMLParser
-from itertools import cycle
+from itertools import cycle, pairwise
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -209,6 +209,33 @@ def test_run_without_loops_is_drawn(tmp_path: Path) -> None:
     assert "No pair of keyframes was proposed as a loop" in html
     assert html.count('id="words"') == 1
     assert "accepted" not in _plots(html)["Loops"]
+
+
+def test_a_run_of_one_scan_has_no_empty_plot(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run").folder)
+    first = replace(
+        run.result.trajectory,
+        **{name: getattr(run.result.trajectory, name)[:1] for name in ("scan_index", "stamp_ns", "T_world_lidar")},
+    )
+    one = replace(run, result=replace(run.result, trajectory=first, attempts=(), keyframe_rows=np.zeros(1, np.int64)))
+    assert "fill: #bbbbbb" in draw_loops(one)
+    assert figures.draw_errors(one) is None
+
+
+@pytest.mark.parametrize(("least_ms", "most_ms"), [(150.0, 4500.0), (1200.0, 36_000.0), (20_000.0, 24_000.0)])
+def test_labels_of_times_do_not_overlap(monkeypatch: pytest.MonkeyPatch, least_ms: float, most_ms: float) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(figures, "svg", lambda figure, name: drawn.append(figure) or name)
+    with matplotlib.rc_context(figures.STYLE):
+        figures.draw_stages(
+            {"verify": {"median": least_ms, "p95": most_ms}, "map": {"median": least_ms, "p95": most_ms}}
+        )
+        drawn[0].draw_without_rendering()
+    (axes,) = drawn[0].axes
+    labels = [label for label in axes.get_xticklabels(which="both") if label.get_text()]
+    spans = sorted((label.get_window_extent().x0, label.get_window_extent().x1) for label in labels)
+    assert len(spans) > 2
+    assert all(end < start for (_, end), (start, _) in pairwise(spans))
 
 
 @pytest.mark.long

@@ -33,6 +33,13 @@ def test_a_run_is_saved_for_rerun_with_its_clouds_paths_and_loops(steps: list[St
     assert {"/world/trajectory", "/world/odometry", "/world/lidar", "/stage_ms/odometry"} <= entities
 
 
+def test_another_ending_than_rerun_s_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_log(tmp_path / "log.mcap", [])
+    assert run("view", tmp_path, "--save", tmp_path / "run.ply") == 2
+    assert "run.ply: Rerun's files end in .rrd" in capsys.readouterr().err
+    assert not (tmp_path / "run.ply").exists()
+
+
 def test_motions_that_were_repaired_or_broken_or_rejected_are_marked(steps: list[Step], tmp_path: Path) -> None:
     made = list(steps)
     states = {10: MotionState.REPAIRED, 20: MotionState.BROKEN, 30: MotionState.CONFIRMED}

@@ -164,3 +164,10 @@ def test_a_thinned_cloud_has_the_mean_point_of_each_voxel_in_range() -> None:
     expected = small_gicp.voxelgrid_sampling(near, CONFIG.voxel_m, 1).points()[:, :3]
     found = downsample(points, config=CONFIG)
     np.testing.assert_allclose(found[np.lexsort(found.T)], expected[np.lexsort(expected.T)], atol=1e-5)
+
+
+def test_an_empty_scan_is_prepared_in_silence(capfd: pytest.CaptureFixture[str]) -> None:
+    """small_gicp writes a warning about a search tree without points."""
+    empty = np.empty((0, 3))
+    assert len(surface(empty)) == len(LightSurface(empty)) == 0
+    assert capfd.readouterr() == ("", "")

@@ -135,7 +135,7 @@ def test_what_is_done_is_not_done_again_and_the_failed_drive_is_tried_again(
 ) -> None:
     folder = tmp_path / "again"
     shutil.copytree(joined.folder, folder)
-    (folder / "runs" / ".friday.0123.part").mkdir()
+    (folder / "runs" / f".friday.{'0123' * 8}.part").mkdir()
     before = _made(folder)
     tried = []
     map_folder = segslam.run.fleets.steps.map_folder
@@ -149,7 +149,7 @@ def test_what_is_done_is_not_done_again_and_the_failed_drive_is_tried_again(
     assert again.drives == joined.drives
     assert _made(folder) == before
     assert tried == [], "the damaged drive fails before it is mapped"
-    assert not (folder / "runs" / ".friday.0123.part").exists()
+    assert not (folder / "runs" / f".friday.{'0123' * 8}.part").exists()
     (recordings[2].parent / "damaged.mcap").rename(recordings[2].parent / "kept")
     try:
         write_mcap(recordings[2], clouds(8))
@@ -257,6 +257,18 @@ def test_nothing_mapped_is_an_error_with_the_first_reason(
     assert run("fleet", tmp_path / "nothing.yaml", "--out", tmp_path / "none") == 2
     assert run("fleet", recordings[0], "--out", tmp_path / "x", "--scheduler", "tcp://x:1", "--workers", "2") == 2
     assert "--workers: " in capsys.readouterr().err
+
+
+def test_a_file_that_is_no_drive_is_named_once_and_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "junk.txt").write_text("no drive\n")
+    (tmp_path / "more.txt").write_text("no drive either\n")
+    assert run("fleet", tmp_path / "junk.txt", tmp_path / "more.txt", "--out", tmp_path / "city") == 2
+    shown = capsys.readouterr().err
+    assert shown.count(f"junk: {tmp_path / 'junk.txt'}: found neither") == 1
+    assert shown.count(f"more: {tmp_path / 'more.txt'}: found neither") == 1
+    assert not (tmp_path / "city").exists()
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.ouster_packets import NUM_COLUMNS, metadata, record
 from helpers.recorded_drive import CLOUD, TOPIC, write_bag1, write_bag2, write_mcap
+from mcap.writer import Writer
 
 from segslam.cli.console import FirstOfEachKind
 from segslam.core.types import BadScan, SegslamError
@@ -135,3 +136,31 @@ def test_a_warning_while_a_recording_is_opened_is_shown(tmp_path: Path, capsys: 
     finally:
         logger.removeHandler(shown)
     assert "the recording is cut short" in capsys.readouterr().err
+
+
+def _written_by_mcap(file: Path, *, name: str, message_encoding: str, schema_encoding: str, is_repeated: bool) -> Path:
+    with file.open("wb") as stream:
+        writer = Writer(stream, repeat_channels=is_repeated, repeat_schemas=is_repeated)
+        writer.start()
+        schema = writer.register_schema(name, schema_encoding, b"uint8[] data")
+        channel = writer.register_channel("/points", message_encoding, schema)
+        writer.add_message(channel, log_time=SECOND, publish_time=SECOND, data=bytes(64))
+        writer.finish()
+    return file
+
+
+def test_clouds_of_ros_1_in_mcap_are_named_so(tmp_path: Path) -> None:
+    """`mcap convert drive.bag drive.mcap` keeps the encoding of ROS 1."""
+    how = {"name": "sensor_msgs/PointCloud2", "message_encoding": "ros1", "schema_encoding": "ros1msg"}
+    file = _written_by_mcap(tmp_path / "a.mcap", **how, is_repeated=True)
+    with pytest.raises(
+        SegslamError, match=r"a\.mcap: messages on /points are encoded as ros1 .*; give the bag of ROS 1"
+    ):
+        open_dataset(file)
+
+
+def test_an_index_without_schemas_is_named_so(tmp_path: Path) -> None:
+    how = {"name": "sensor_msgs/msg/PointCloud2", "message_encoding": "cdr", "schema_encoding": "ros2msg"}
+    file = _written_by_mcap(tmp_path / "a.mcap", **how, is_repeated=False)
+    with pytest.raises(SegslamError, match=r"a\.mcap: .* lacks channels or schemas; `mcap recover` adds them\); see"):
+        open_dataset(file)

@@ -141,6 +141,38 @@ def test_a_file_of_three_values_per_point_is_rejected(tmp_path: Path) -> None:
 
 
 @pytest.mark.data
+@pytest.mark.parametrize("order", ["as recorded", "shuffled"])
+@pytest.mark.parametrize("scale", [1.0, 255.0])
+@pytest.mark.parametrize("num", [3, 4, 5, 6, 7])
+def test_the_values_per_point_of_real_scans_are_found(
+    data_dir: Path, tmp_path: Path, num: int, scale: float, order: str
+) -> None:
+    """As nuScenes' files: x y z intensity ring; and those with times and normals."""
+    rng = np.random.default_rng(0)
+    sources = [
+        *sorted((data_dir / "courtyard/velodyne").glob("*0.bin")),
+        *sorted((data_dir / "kitti/sequences/00/velodyne").glob("*.bin"))[:3],
+    ]
+    file = tmp_path / "000000.pcd.bin"
+    for source in sources:
+        points = np.fromfile(source, "<f4").reshape(-1, 4)
+        points = points[: len(points) // 20 * 20]  # any number of values fits the size of the file
+        if order == "shuffled":
+            points = rng.permutation(points)
+        elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+        ring = np.round(40.0 * (elevation - elevation.min()))
+        share = points[:, 3] / max(points[:, 3].max(), 1.0)
+        times, last = np.linspace(0.0, 0.1, len(points)), rng.uniform(size=len(points))
+        columns = [points[:, :3], scale * share, ring, times, last]
+        np.column_stack(columns)[:, :num].astype("<f4").tofile(file)
+        if num == 4:
+            assert len(read_returns(file)) == len(points)
+            continue
+        with pytest.raises(BadScan, match=rf"does not have 4 values per point .* but {num}; .*\(-1, {num}\)"):
+            read_returns(file)
+
+
+@pytest.mark.data
 def test_no_real_scan_is_taken_for_one_of_other_columns(data_dir: Path) -> None:
     files = [
         *(data_dir / "kitti/sequences/00/velodyne").glob("*.bin"),

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
+from helpers.recorded_drive import CLOUD, TOPIC, write_mcap
 
 from segslam.core import geometry
 from segslam.core.trajectory import write_kitti
@@ -172,6 +173,18 @@ def test_a_folder_of_two_kinds_of_scans_is_refused(tmp_path: Path) -> None:
     _write_ply(tmp_path / "2.ply", "xyz", "1 2 3")
     with pytest.raises(SegslamError, match=r"2 kinds of scans \(\.bin 2, \.ply 1\); put each kind into its own folder"):
         open_dataset(tmp_path)
+
+
+def test_endings_in_capitals_are_the_same(tmp_path: Path) -> None:
+    (tmp_path / "drive").mkdir()
+    for name in ("0.PCD", "1.pcd"):
+        header = (
+            "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA ascii\n"
+        )
+        (tmp_path / "drive" / name).write_text(f"{header}1 2 3\n")
+    assert [scan.points.tolist() for scan in open_dataset(tmp_path / "drive")] == [[[1.0, 2.0, 3.0]]] * 2
+    drive = ((10**9, np.ones(5, CLOUD)),)
+    assert len(open_dataset(write_mcap(tmp_path / "DRIVE.MCAP", drive), topic=TOPIC)) == 1
 
 
 def test_a_ply_without_positions_is_named(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from segslam.core.config.sections import SegregatorConfig as SegregatorConfig
 from segslam.core.config.sections import SensorCalibrationConfig as SensorCalibrationConfig
 from segslam.core.config.sections import VerifyConfig as VerifyConfig
 from segslam.core.errors import SegslamError, brief
-from segslam.core.whole_files import read_text
+from segslam.core.whole_files import expanded, read_text
 
 logger = logging.getLogger(__name__)
 Model = TypeVar("Model", bound=BaseModel)
@@ -124,7 +124,7 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = (), *
     Raises SegslamError, naming the file and key, for unreadable YAML, unknown keys and values out of range.
     """
     values = base.model_dump(mode="json") if base else {}
-    given = _parse_yaml(read_text(Path(path), "configuration", "give a YAML file"), str(path)) if path else {}
+    given = _parse_yaml(read_text(expanded(path), "configuration", "give a YAML file"), str(path)) if path else {}
     for name, section in given.items():
         known = values.get(name)
         values[name] = known | section if isinstance(known, dict) and isinstance(section, dict) else section

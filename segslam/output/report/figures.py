@@ -96,6 +96,7 @@ def draw_loops(run: FinishedRun) -> str:
     axes = figure.subplots()
     positions = run.result.trajectory.T_world_lidar[:, :2, 3]
     axes.plot(*positions.T, color="#BBBBBB", linewidth=1.2, zorder=1, label="trajectory")
+    axes.plot(*positions[0], "o", color="#BBBBBB", markersize=5, zorder=1)
     ends = positions[run.result.keyframe_rows]
     for label, color, is_closed, pairs in _by_outcome(run):
         if not is_closed:
@@ -125,8 +126,8 @@ def draw_loops_over_time(run: FinishedRun) -> str:
 
 
 def draw_errors(run: FinishedRun) -> str | None:
-    """Errors of position and height against travel, after the alignment of the ATE; None without ground truth."""
-    if (true := true_scans(run)) is None:
+    """Errors of position and height against travel, after the alignment of the ATE; None below 2 true poses."""
+    if (true := true_scans(run)) is None or len(true[0]) < 2:
         return None
     rows, truth = true
     figure = Figure(figsize=(WIDTH_IN, 5.4), layout="constrained")
@@ -232,6 +233,7 @@ def plain_powers(axis: Axis) -> None:
     """Label a logarithmic axis with plain numbers: `STYLE` draws no formulas."""
     axis.set_major_formatter(_PlainPowers())
     axis.set_minor_formatter(_PlainPowers(minor_thresholds=(1.0, 0.4)))
+    axis.set_tick_params(which="minor", labelsize=8)  # otherwise labels of five digits overlap
 
 
 def legend_on_top(axes: Axes, *, num_columns: int) -> None:

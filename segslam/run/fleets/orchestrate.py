@@ -5,7 +5,7 @@ import json
 import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -103,7 +103,11 @@ def _alone_in(folder: Path) -> Iterator[None]:
             steps.remove_unfinished(folder)
         except OSError as error:
             raise not_writable(folder, error) from error
-        yield
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # it is removed only if it is empty
+                folder.rmdir()
     finally:
         os.close(lock)
 
@@ -146,11 +150,13 @@ class _Fleet:
     def _done(self, step: str, function: Callable[..., Mapped], drives: Sequence[Drive | Mapped]) -> list[Mapped]:
         """The drives for which the step did not fail."""
         outcomes = self._all(step, function, [(self._folder, drive) for drive in drives])
-        for drive, outcome in zip(drives, outcomes, strict=True):
-            if outcome.failure is not None:
-                self._reasons[drive.name] = outcome.failure
-                self._say(f"{drive.name}: {outcome.failure}")
-        return [outcome.value for outcome in outcomes if outcome.failure is None]
+        done = [outcome.value for outcome in outcomes if outcome.failure is None]
+        failed = [(drive.name, one.failure) for drive, one in zip(drives, outcomes, strict=True) if one.failure]
+        num_in_error = int(not done and not self._reasons)
+        for name, reason in failed[num_in_error:]:
+            self._say(f"{name}: {reason}")
+        self._reasons |= failed
+        return done
 
     def _proposed(self, mapped: Sequence[Mapped]) -> dict[tuple[int, int], list[tuple[int, float]]]:
         """Keyframes of a drive that look most like places of an earlier one, by the numbers of both."""

@@ -54,7 +54,7 @@ class FolderSource(Source):
         if self._fd < 0 or libc.inotify_add_watch(self._fd, os.fsencode(self._folder), mask) < 0:
             why = os.strerror(ctypes.get_errno())
             raise SegslamError(f"{self._folder}: cannot be watched ({why}); give a folder on a local disk")
-        there = [entry for entry in self._folder.iterdir() if entry.suffix in SUFFIXES]
+        there = [entry for entry in self._folder.iterdir() if entry.suffix.lower() in SUFFIXES]
         self._has_missed = self._noted_ns.value > 0
         if there and not self._has_missed:
             tell(f"{len(there)} scans already in {self._folder} are ignored; use segslam map for these")
@@ -86,7 +86,7 @@ class FolderSource(Source):
             self._fd = -1
 
     def _is_scan(self, file: Path) -> bool:
-        return file.suffix in SUFFIXES and not file.name.startswith(".")
+        return file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
 
     def _put(self, file: Path, waiting: Waiting) -> None:
         """Put the scan of a file, unless its content is that of the scan put before."""

@@ -21,8 +21,8 @@ from segslam.scans.scan_files import read_bytes
 
 VERTICAL_ANGLE_DEG = 0.205
 """Angle by which the points of KITTI's scans are too low; value of KISS-ICP (Vizzo et al., RA-L 2023)."""
-FEWEST_COMPARED, MOST_COMPARED = 1_200, 100_000
-"""Values of a file from which the number per point is found: 300 points at least; more than 100,000 only take time."""
+FEWEST_COMPARED, NUM_COMPARED = 1_200, 20_000
+"""Values of a file from which the number per point is found, and pairs of them that are compared."""
 LIDAR_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
 """Names of T_camera_lidar in calib.txt, in KITTI's odometry, object and tracking benchmarks."""
 
@@ -89,23 +89,24 @@ def read_returns(file: Path) -> Float32[np.ndarray, "_ 4"]:
 
 
 def _values_per_point(values: Float32[np.ndarray, " _"]) -> int:
-    """The distance in the file, 3 to 7, at which values differ least in the mean; 4 for a file of few values.
+    """The distance in the file, 3 to 7, at whose multiples values differ least in the mean; 4 for a file of few values.
 
-    At a multiple of the number per point both values are of one column. In any order of the points their mean
-    difference is then smallest: the energy distance of distributions is not negative (Szekely and Rizzo 2013).
+    There both values are of one column, so their mean difference is smallest: the energy distance of distributions is
+    not negative (Szekely and Rizzo 2013). Values of random points are compared: neighbours may be on opposite sides.
     """
     if len(values) < FEWEST_COMPARED:
         return 4
-    some = np.nan_to_num(values[:MOST_COMPARED], posinf=0.0, neginf=0.0)
-    with np.errstate(over="ignore"):
-        differences = {
-            num: float(np.abs(some[num:] - some[:-num]).mean(dtype=float))
-            for num in (4, 3, 5, 6, 7)
-            if num == 4 or len(values) % num == 0
-        }
-    num = min(differences, key=differences.__getitem__)
-    of_two_columns = min(differences[other] for other in differences if other % 3)
-    is_multiple = num == 6 and 2.0 * differences[3] < differences[6] + of_two_columns
+    rng = np.random.default_rng(0)
+    first = rng.integers(len(values) // 4 * 4, size=NUM_COMPARED)
+    means, errors = {}, {}
+    for num in (4, 3, 5, 6, 7):
+        if num == 4 or len(values) % num == 0:
+            second = num * rng.integers(len(values) // num, size=NUM_COMPARED) + first % num
+            pairs = np.nan_to_num(values[[first, second]].astype(float), posinf=0.0, neginf=0.0)
+            differences = np.abs(pairs[0] - pairs[1])
+            means[num], errors[num] = float(differences.mean()), float(differences.std()) * NUM_COMPARED**-0.5
+    num = min(means, key=means.__getitem__)
+    is_multiple = num == 6 and means[3] - means[6] < 3.0 * (errors[3] + errors[6])
     return 3 if is_multiple else num
 
 

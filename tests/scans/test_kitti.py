@@ -175,9 +175,9 @@ def test_the_values_per_point_of_real_scans_are_found(
 @pytest.mark.data
 def test_points_that_alternate_between_opposite_sides_are_read(data_dir: Path, tmp_path: Path) -> None:
     """As those of two sensors in turn: neighbours in the file differ more than other points."""
-    for source in sorted((data_dir / "courtyard/velodyne").glob("*0.bin")):
+    for source in sorted((data_dir / "kitti/sequences/00/velodyne").glob("*.bin"))[:5]:
         points = np.fromfile(source, "<f4").reshape(-1, 4)
-        points = points[: len(points) // 20 * 20]
+        points = points[: len(points) // 420 * 420]  # any number of values fits the size of the file
         by_azimuth = np.argsort(np.arctan2(points[:, 1], points[:, 0])).reshape(2, -1)
         points[by_azimuth.T.ravel()].tofile(tmp_path / "000000.bin")
         assert len(read_returns(tmp_path / "000000.bin")) == len(points)

@@ -23,6 +23,8 @@ VERTICAL_ANGLE_DEG = 0.205
 """Angle by which the points of KITTI's scans are too low; value of KISS-ICP (Vizzo et al., RA-L 2023)."""
 FEWEST_COMPARED, MOST_COMPARED = 1_200, 100_000
 """Values of a file from which the number per point is found: 300 points at least; more than 100,000 only take time."""
+SIGNIFICANT = 5.0
+"""Chosen, in standard errors: the least by which the mean difference is smaller than at a distance of 4."""
 LIDAR_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
 """Names of T_camera_lidar in calib.txt, in KITTI's odometry, object and tracking benchmarks."""
 
@@ -89,21 +91,21 @@ def read_returns(file: Path) -> Float32[np.ndarray, "_ 4"]:
 
 
 def _values_per_point(values: Float32[np.ndarray, " _"]) -> int:
-    """The distance in the file, 3 to 7, at which values differ least in the mean; 4 for a file of few values.
+    """The distance in the file, 3 to 7, at which values differ least in the mean; 4 if none is significant.
 
     At a multiple of the number per point both values are of one column. In any order of the points their mean
     difference is then smallest: the energy distance of distributions is not negative (Szekely and Rizzo 2013).
     """
     if len(values) < FEWEST_COMPARED:
         return 4
-    some = np.nan_to_num(values[:MOST_COMPARED], posinf=0.0, neginf=0.0)
-    with np.errstate(over="ignore"):
-        differences = {
-            num: float(np.abs(some[num:] - some[:-num]).mean(dtype=float))
-            for num in (4, 3, 5, 6, 7)
-            if num == 4 or len(values) % num == 0
-        }
+    some = np.nan_to_num(values[:MOST_COMPARED].astype(np.float64), posinf=0.0, neginf=0.0)
+    numbers = [4, *(num for num in (3, 5, 6, 7) if len(values) % num == 0)]
+    gaps = {num: np.abs(some[num:] - some[:-num]) for num in numbers}
+    differences = {num: float(gap.mean()) for num, gap in gaps.items()}
     num = min(differences, key=differences.__getitem__)
+    standard_error = float(gaps[4].std()) * (2.0 / len(some)) ** 0.5
+    if differences[4] - differences[num] <= SIGNIFICANT * standard_error:
+        return 4
     of_two_columns = min(differences[other] for other in differences if other % 3)
     is_multiple = num == 6 and 2.0 * differences[3] < differences[6] + of_two_columns
     return 3 if is_multiple else num

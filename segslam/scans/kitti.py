@@ -4,6 +4,7 @@ The number of a scan is that of its file. It is also its row in times.txt and in
 files hold poses of the left camera in the frame of the first; this module returns LiDAR poses.
 """
 
+import math
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,8 +22,10 @@ from segslam.scans.scan_files import read_bytes
 
 VERTICAL_ANGLE_DEG = 0.205
 """Angle by which the points of KITTI's scans are too low; value of KISS-ICP (Vizzo et al., RA-L 2023)."""
-FEWEST_COMPARED, NUM_COMPARED = 1_200, 20_000
-"""Values of a file from which the number per point is found, and pairs of them that are compared."""
+FEWEST_COMPARED, MOST_COMPARED = 1_200, 40_000
+"""Values of a file from which the number per point is found, and pairs of values that are compared."""
+SIGNIFICANT = 4.0
+"""Chosen, in standard errors: the least by which the mean difference at another distance than 4 is smaller."""
 LIDAR_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
 """Names of T_camera_lidar in calib.txt, in KITTI's odometry, object and tracking benchmarks."""
 
@@ -89,25 +92,30 @@ def read_returns(file: Path) -> Float32[np.ndarray, "_ 4"]:
 
 
 def _values_per_point(values: Float32[np.ndarray, " _"]) -> int:
-    """The distance in the file, 3 to 7, at whose multiples values differ least in the mean; 4 for a file of few values.
+    """The distance in the file, 3 to 7, at whose multiples values differ least in the mean; 4 if none is significant.
 
     There both values are of one column, so their mean difference is smallest: the energy distance of distributions is
     not negative (Szekely and Rizzo 2013). Values of random points are compared: neighbours may be on opposite sides.
     """
     if len(values) < FEWEST_COMPARED:
         return 4
-    rng = np.random.default_rng(0)
-    first = rng.integers(len(values) // 4 * 4, size=NUM_COMPARED)
-    means, errors = {}, {}
+    rng, size = np.random.default_rng(0), min(len(values), MOST_COMPARED)
+    first = rng.integers(len(values) // 4 * 4, size=size)
+    means, variances = {}, {}
     for num in (4, 3, 5, 6, 7):
         if num == 4 or len(values) % num == 0:
-            second = num * rng.integers(len(values) // num, size=NUM_COMPARED) + first % num
+            second = num * rng.integers(len(values) // num, size=size) + first % num
             pairs = np.nan_to_num(values[[first, second]].astype(float), posinf=0.0, neginf=0.0)
             differences = np.abs(pairs[0] - pairs[1])
-            means[num], errors[num] = float(differences.mean()), float(differences.std()) * NUM_COMPARED**-0.5
+            means[num], variances[num] = float(differences.mean()), float(differences.var()) / size
+
+    def is_smaller(num: int, other: int) -> bool:
+        return means[other] - means[num] > SIGNIFICANT * math.sqrt(variances[num] + variances[other])
+
     num = min(means, key=means.__getitem__)
-    is_multiple = num == 6 and means[3] - means[6] < 3.0 * (errors[3] + errors[6])
-    return 3 if is_multiple else num
+    if not is_smaller(num, 4):
+        return 4
+    return 3 if num == 6 and not is_smaller(6, 3) else num
 
 
 def read_calibration(file: Path) -> Transform:

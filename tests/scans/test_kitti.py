@@ -140,6 +140,14 @@ def test_a_file_of_three_values_per_point_is_rejected(tmp_path: Path) -> None:
     assert len(read_returns(file)) == 12_000
 
 
+@pytest.mark.parametrize("num_points", [300, 3000, 30_000])
+def test_four_columns_of_one_distribution_are_read(tmp_path: Path, num_points: int) -> None:
+    file = tmp_path / "000000.bin"
+    for seed in range(10):
+        np.random.default_rng(seed).normal(size=(num_points, 4)).astype("<f4").tofile(file)
+        assert len(read_returns(file)) == num_points
+
+
 @pytest.mark.data
 @pytest.mark.parametrize("order", ["as recorded", "shuffled"])
 @pytest.mark.parametrize("scale", [1.0, 255.0])

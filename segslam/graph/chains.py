@@ -6,10 +6,10 @@ body, so in the world frame the covariances of its links add up, and those of a 
 two sums.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from segslam.core import geometry
@@ -41,7 +41,11 @@ class Chains:
         self._summed, self._length = Rows(summed), Rows(length)
         self._ends = np.unique(np.array([(edge.a, edge.b) for edge in closures], dtype=np.int64))
         self._links = self._linked(closures)
-        self._found: dict[int, tuple[Vector, Matrices]] = {}
+        pairs = np.array(list(self._links), dtype=np.int64).reshape(-1, 2)
+        lengths = [length for length, _ in self._links.values()]
+        self._graph = coo_array((lengths, tuple(pairs.T)), shape=(len(self._ends), len(self._ends))).tocsr()
+        self._trees: dict[int, _Tree] = {}
+        """Those of the last keyframe; the next one starts at the same ends, or at one of them."""
 
     def add(self, T_world: Transform, motion: Edge) -> None:
         """Add the next vertex."""
@@ -54,15 +58,16 @@ class Chains:
         length, summed = self._odometry(source_id, ids)
         if len(self._ends):
             starts = sorted({int(row[0]) for row in self._beside(np.array([source_id]))})
+            self._trees = {start: self._trees.get(start) or _Tree(self._graph, start) for start in starts}
             for row in self._beside(ids):
                 along, between = self._odometry(self._ends[row], ids)
-                for start in starts:
+                for start, tree in self._trees.items():
                     way, own = self._odometry(source_id, self._ends[[start]])
-                    lengths, covariances = self._from(start)
+                    lengths, covariances = tree.lengths, tree.covariances(row, self._links)
                     total = way + lengths[row] + along
                     shorter = total < length
                     length = np.where(shorter, total, length)
-                    summed[shorter] = (own + covariances[row] + between)[shorter]
+                    summed[shorter] = (own + covariances + between)[shorter]
         (turn,) = adjoints(geometry.inverse(self._T_world.all()[source_id])[None])
         return np.einsum("kij,lj->kil", np.einsum("ij,kjl->kil", turn, summed), turn)  # uses one thread
 
@@ -90,19 +95,27 @@ class Chains:
                     links[first, last] = length, covariance
         return links
 
-    def _from(self, start: int) -> tuple[Vector, Matrices]:
-        """Lengths and covariances from one row of ends to all; cached: most keyframes in a row start at the same."""
-        if start not in self._found:
-            num = len(self._ends)
-            pairs = np.array(list(self._links), dtype=np.int64).reshape(-1, 2)
-            graph = coo_array(([length for length, _ in self._links.values()], tuple(pairs.T)), shape=(num, num))
-            lengths, before = dijkstra(graph, directed=False, indices=start, return_predecessors=True)
-            covariances = np.zeros((num, 6, 6))
-            for row in np.argsort(lengths, kind="stable")[1:].tolist():
-                previous = int(before[row])
-                covariances[row] = covariances[previous] + self._links[min(row, previous), max(row, previous)][1]
-            self._found[start] = lengths, covariances
-        return self._found[start]
+
+class _Tree:
+    """The shortest chains from one of the ends to all others."""
+
+    def __init__(self, graph: csr_array, start: int) -> None:
+        self.lengths, self._before = dijkstra(graph, directed=False, indices=start, return_predecessors=True)
+        self._covariances = np.zeros((len(self.lengths), 6, 6))
+        self._is_known = np.arange(len(self.lengths)) == start
+
+    def covariances(self, ends: Indices, links: Mapping[tuple[int, int], Link]) -> Matrices:
+        """(k, 6, 6) covariances of the chains to some ends, in the world frame."""
+        for end in np.unique(ends[~self._is_known[ends]]).tolist():
+            chain = []
+            while not self._is_known[end]:
+                chain.append(end)
+                end = int(self._before[end])
+            for row in reversed(chain):
+                self._covariances[row] = self._covariances[end] + links[min(row, end), max(row, end)][1]
+                self._is_known[row] = True
+                end = row
+        return self._covariances[ends]
 
 
 def _length(edge: Edge) -> float:

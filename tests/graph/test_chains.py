@@ -1,6 +1,7 @@
 """Covariances along the shortest chains, against every chain and against drives with noise; the gate of a prior."""
 
 import itertools
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -43,6 +44,17 @@ def composed(edges: list[Edge], path: list[int]) -> np.ndarray:
         (turn,) = adjoints(geometry.inverse(T_a_b)[None])
         found = turn @ found @ turn.T + own
     return found
+
+
+def test_memory_does_not_grow_with_the_keyframes_that_are_asked_about() -> None:
+    poses, odometry = drive(600, np.random.default_rng(0))
+    chains = Chains(poses, odometry, [loop(poses, a, a + 300, 0.05) for a in range(300)])
+    tracemalloc.start()
+    for source in range(600):
+        chains.covariances(source, np.array([0, 299]))
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 10 * 600 * 288, "covariances from at most some keyframes to all others are kept"
 
 
 @settings(max_examples=40, deadline=None)

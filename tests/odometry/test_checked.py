@@ -813,7 +813,8 @@ def test_a_map_before_a_break_is_used_again_if_it_explains_the_scan_better(is_be
     T_odom_lidar = last @ geometry.inverse(truth.T_world_lidar[SLIP_AT - 1]) @ truth.T_world_lidar[SLIP_AT]
     there = before.register(scan, geometry.inverse(before.T_odom_map) @ T_odom_lidar)[0]
     here = replace(there, mean_log=there.mean_log + (-1.0 if is_better else 0.5) * there.num_patches**-0.5)
-    assert bool(odometry._rejoined(T_odom_lidar, T_odom_lidar, scan, [here])) is is_better
+    proposed = Proposed(scan, T_odom_lidar, T_odom_lidar, 1.0)
+    assert (odometry._rejoined(proposed, [here]) is not None) is is_better
     assert (odometry._map is before) is is_better
 
 

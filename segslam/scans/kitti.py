@@ -105,7 +105,7 @@ def _values_per_point(values: Float32[np.ndarray, " _"]) -> int:
     for num in (4, 3, 5, 6, 7):
         if num == 4 or len(values) % num == 0:
             second = num * rng.integers(len(values) // num, size=size) + first % num
-            pairs = np.nan_to_num(values[[first, second]].astype(float), posinf=0.0, neginf=0.0)
+            pairs = np.nan_to_num(values[[first, second]], posinf=0.0, neginf=0.0).astype(float)
             differences = np.abs(pairs[0] - pairs[1])
             means[num], variances[num] = float(differences.mean()), float(differences.var()) / size
 

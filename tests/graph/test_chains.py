@@ -46,7 +46,7 @@ def composed(edges: list[Edge], path: list[int]) -> np.ndarray:
     return found
 
 
-def test_memory_does_not_grow_with_the_keyframes_that_are_asked_about() -> None:
+def test_memory_does_not_grow_with_the_number_of_keyframes_compared() -> None:
     poses, odometry = drive(600, np.random.default_rng(0))
     chains = Chains(poses, odometry, [loop(poses, a, a + 300, 0.05) for a in range(300)])
     tracemalloc.start()

@@ -24,8 +24,8 @@ VERTICAL_ANGLE_DEG = 0.205
 """Angle by which the points of KITTI's scans are too low; value of KISS-ICP (Vizzo et al., RA-L 2023)."""
 FEWEST_COMPARED, MOST_COMPARED = 1_200, 40_000
 """Values of a file from which the number per point is found, and pairs of values that are compared."""
-SIGNIFICANT = 4.0
-"""Chosen, in standard errors: the least by which the mean difference at another distance than 4 is smaller."""
+LEAST_ERRORS = 4.0
+"""Chosen, in standard errors: least difference of two means that is not by chance (0.00003)."""
 LIDAR_KEYS = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
 """Names of T_camera_lidar in calib.txt, in KITTI's odometry, object and tracking benchmarks."""
 
@@ -110,7 +110,7 @@ def _values_per_point(values: Float32[np.ndarray, " _"]) -> int:
             means[num], variances[num] = float(differences.mean()), float(differences.var()) / size
 
     def is_smaller(num: int, other: int) -> bool:
-        return means[other] - means[num] > SIGNIFICANT * math.sqrt(variances[num] + variances[other])
+        return means[other] - means[num] > LEAST_ERRORS * math.sqrt(variances[num] + variances[other])
 
     num = min(means, key=means.__getitem__)
     if not is_smaller(num, 4):

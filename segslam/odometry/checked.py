@@ -138,9 +138,9 @@ class CheckedOdometry:
         """True if the motion is as long as a keyframe's since the last checked scan, or unlike the last motion."""
         if len(self._map) == 0 or self._is_watched or proposed.gap > 1.0 or self._num_unchecked >= MOST_UNCHECKED:
             return True
-        few = proposed.scan.few
-        moved_m = geometry.displacement_m(few, proposed.T_odom_lidar, self._map.T_odom_map)
-        sudden_m = geometry.displacement_m(few, proposed.T_odom_lidar, proposed.T_odom_predicted)
+        moments = proposed.scan.moments
+        moved_m = geometry.displacement_m(moments, proposed.T_odom_lidar, self._map.T_odom_map)
+        sudden_m = geometry.displacement_m(moments, proposed.T_odom_lidar, proposed.T_odom_predicted)
         return moved_m >= self._config.keyframes.distance_m or sudden_m >= self._refine.voxel_m
 
     def _confirmed(self, proposed: Proposed) -> tuple[Transform, Motion] | None:

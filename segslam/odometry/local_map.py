@@ -35,9 +35,9 @@ class SeenScan:
         self._config = config
 
     @cached_property
-    def few(self) -> Points:
-        """(k, 3) some hundred of the points, float64."""
-        return self.points[:: max(1, len(self.points) // 500)].astype(np.float64)
+    def moments(self) -> geometry.Moments:
+        """Of some hundred of the points, for `geometry.displacement_m`."""
+        return geometry.moments_of(self.points[:: max(1, len(self.points) // 500)].astype(np.float64))
 
     @cached_property
     def thinned(self) -> Points:
@@ -101,7 +101,7 @@ class LocalMap:
     def add(self, T_odom_lidar: Transform, scan: SeenScan) -> None:
         """Add a scan, unless it is too near to the newest one."""
         if self._scans:
-            moved_m = geometry.displacement_m(scan.few, T_odom_lidar, self.T_odom_map)
+            moved_m = geometry.displacement_m(scan.moments, T_odom_lidar, self.T_odom_map)
             if moved_m < SPACING_VOXELS * self.voxel_m:
                 return
         self._scans.append((T_odom_lidar, scan.thinned))
@@ -129,11 +129,13 @@ class LocalMap:
         return geometry.apply(self.pose_of(T_odom_lidar), points.astype(np.float64))
 
     def surface(self) -> refinement.Surface:
-        """The surface of all scans, in the frame of the newest one; cached."""
+        """The surface of all scans as far from the newest one as a scan reaches, in its frame; cached."""
         if self._surface is None:
             clouds = [self._in_map(thinned, T_odom_lidar) for T_odom_lidar, thinned in self._scans]
-            merged = clouds[0] if len(clouds) == 1 else voxel_means(np.vstack(clouds), self.voxel_m).astype(np.float32)
-            self._surface = refinement.make_surface(merged, config=self._config)
+            merged = clouds[0]
+            if len(clouds) > 1:
+                merged = voxel_means(np.vstack(clouds), self.voxel_m, within_m=refinement.MAX_RANGE_M)
+            self._surface = refinement.make_surface(merged.astype(np.float32), config=self._config)
         return self._surface
 
     @property

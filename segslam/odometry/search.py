@@ -44,7 +44,7 @@ class PoseSearch:
 
     def is_same(self, T_map_a: Transform, T_map_b: Transform) -> bool:
         """True if a registration from one of two poses reaches the other."""
-        return geometry.displacement_m(self._scan.few, T_map_a, T_map_b) < self._same_m
+        return geometry.displacement_m(self._scan.moments, T_map_a, T_map_b) < self._same_m
 
     def near(self, T_map_proposed: Sequence[Transform], known: Sequence[Fit] = ()) -> list[Fit]:
         """`known` poses and those to which registrations from the proposals lead, the most probable first."""
@@ -115,7 +115,7 @@ class PoseSearch:
         return replace(fit, log_prior=self._prior(fit))
 
     def _apart_m(self, one: Fit, other: Fit) -> float:
-        return geometry.displacement_m(self._scan.few, one.T_map_lidar, other.T_map_lidar)
+        return geometry.displacement_m(self._scan.moments, one.T_map_lidar, other.T_map_lidar)
 
     def _compared(self, fits: Sequence[Fit], *, num_ordered: int = 1) -> list[Fit]:
         """The most probable pose first; of poses near each other only the one that explains the scan best.

@@ -66,6 +66,19 @@ def poses(graph: G2oGraph) -> np.ndarray:
     return np.array(list(graph.T_world_vertex.values()))
 
 
+@pytest.mark.parametrize("robust", ["none", "cauchy"])
+def test_a_result_is_judged_by_the_edges_that_it_may_not_leave_out(robust: str) -> None:
+    graph, _ = square(num_false=1)
+    found = optimize_graph(graph, robust=robust)
+    assert found.num_outliers >= 1
+    assert found.chi2_per_dof is not None
+    everything = 2.0 * found.final_error / (6 * (len(graph.edges) - len(graph.T_world_vertex) + 1))
+    if robust == "none":
+        assert found.chi2_per_dof == pytest.approx(everything, rel=1e-6)
+    else:
+        assert found.chi2_per_dof < 0.1 * everything
+
+
 @pytest.mark.parametrize("robust", ["none", "huber", "cauchy", "geman-mcclure", "gnc", "consistent"])
 def test_exact_edges_give_the_exact_poses(robust: str) -> None:
     graph, truth = square()

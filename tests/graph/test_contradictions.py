@@ -83,7 +83,7 @@ def test_repeated_edges_that_agree_are_odometry() -> None:
     assert len(contradicting([graph.edges[3], false_edge(graph.edges[3], 0.5)])) == 1
 
 
-@pytest.mark.parametrize("errors", [(90.0, 80.0), (80.0, 90.0)])
+@pytest.mark.parametrize("errors", [(90.0, 80.0), (80.0, 90.0), (25.0, 20.0)])
 def test_of_the_optima_near_two_starts_the_better_one_is_returned(
     monkeypatch: pytest.MonkeyPatch, errors: tuple[float, float]
 ) -> None:

@@ -176,6 +176,14 @@ def test_an_odometry_that_agrees_corrects_its_errors_itself(metres: float, state
         assert off_m < 0.06
     for after, undisturbed in zip(results[JUMPS_AT + 1 :], plain[JUMPS_AT + 1 :], strict=True):
         np.testing.assert_allclose(after.T_odom_lidar, undisturbed.T_odom_lidar, atol=0.06)
+        assert (after.motion and after.motion.state) is (undisturbed.motion and undisturbed.motion.state)
+
+
+def test_a_tracked_scan_has_the_result_of_its_check() -> None:
+    scans, truth = round_drive()
+    tracker = Tracker(CONFIG, odometry=_LikeKiss(truth, CONFIG.odometry))
+    states = [tracker.track(scan).motion.state for scan in scans[:4]]
+    assert MotionState.UNCHECKED not in states[1:]
 
 
 def test_without_the_check_a_jump_remains() -> None:
@@ -560,10 +568,26 @@ def test_a_pose_that_is_kept_is_unsure_by_its_distance_from_the_registered_one(s
     np.testing.assert_allclose(motion.covariance, expected, atol=1e-9)
 
 
-def test_a_scan_has_some_hundred_points_for_quick_looks() -> None:
-    points = np.random.default_rng(0).normal(size=(20_000, 3)).astype(np.float32)
-    assert 500 <= len(SeenScan(points, CONFIG.refine).few) <= 510
-    assert len(SeenScan(points[:300], CONFIG.refine).few) == 300
+@pytest.mark.parametrize("num_points", [300, 20_000])
+def test_how_far_two_poses_move_a_scan_is_seen_by_some_of_its_points(num_points: int) -> None:
+    points = np.random.default_rng(0).normal(size=(num_points, 3)).astype(np.float32)
+    T_a, T_b = (geometry.exp(np.array([0.1, -0.2, k, 1.0 + k, 2.0, -0.5])) for k in (0.3, 0.35))
+    apart = geometry.apply(T_a, points) - geometry.apply(T_b, points)
+    expected_m = np.sqrt(np.mean(np.sum(apart**2, axis=1)))
+    moments = SeenScan(points, CONFIG.refine).moments
+    assert geometry.displacement_m(moments, T_a, T_b) == pytest.approx(expected_m, rel=0.02)
+    assert geometry.displacement_m(moments, T_a, T_a) == 0.0
+
+
+def test_the_local_map_ends_where_no_scan_reaches() -> None:
+    generator = np.random.default_rng(1)
+    points = np.column_stack([generator.uniform(-55.0, 55.0, (4000, 2)), np.zeros(4000)]).astype(np.float32)
+    local = LocalMap(CONFIG.refine)
+    for x_m in (0.0, 40.0):
+        local.add(geometry.transform(np.eye(3), [x_m, 0.0, 0.0]), SeenScan(points, CONFIG.refine))
+    far_m = np.linalg.norm(local.surface().points, axis=1)
+    assert 55.0 < far_m.max() < 60.0
+    assert local.surface().points[:, 0].min() < -58.0  # seen by the scan before
 
 
 def test_a_given_motion_predicts_the_next_one() -> None:
@@ -693,6 +717,17 @@ def _into_a_tunnel(num_scans: int = 40) -> list[Scan]:
     """The tunnel begins at scan 11, and the sensor continues as before."""
     street = [replace(scan, index=row, stamp_ns=row * 100_000_000) for row, scan in enumerate(round_drive()[0][:11])]
     return street + [_tunnel_scan(row) for row in range(11, num_scans)]
+
+
+def test_points_on_a_plane_are_as_likely_as_nine_tenths_of_inliers_make_them() -> None:
+    at_m = np.arange(0.25, 15.0, 0.5)
+    wall = np.stack([*np.meshgrid(at_m, at_m), np.full((30, 30), 2.0)], axis=-1).reshape(-1, 3).astype(np.float32)
+    found = fit(wall, SeenScan(wall, CONFIG.refine).light, np.eye(4), voxel_m=0.5, sigma_m=0.1)
+    away = fit(wall + np.float32(30.0), SeenScan(wall, CONFIG.refine).light, np.eye(4), voxel_m=0.5, sigma_m=0.1)
+    outlier = 0.1 / 2.0
+    assert found.mean_log == pytest.approx(np.log(0.9 / (np.sqrt(2.0 * np.pi) * 0.1) + outlier), abs=1e-6)
+    assert away.mean_log == pytest.approx(np.log(outlier), abs=1e-6)
+    assert (found.overlap, away.overlap) == (1.0, 0.0)
 
 
 def test_a_scan_of_a_smooth_tunnel_does_not_constrain_the_position_along_it() -> None:

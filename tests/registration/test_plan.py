@@ -8,7 +8,7 @@ import pytest
 from segslam.core import geometry
 from segslam.core.config import load_config
 from segslam.core.types import Alignment, Label, Points, Registration, Transform
-from segslam.registration.segregator.plan import CELL_M, NUM_YAWS, FloorPlan, plan_hypotheses
+from segslam.registration.segregator.plan import CELL_M, HALF, MAX_COUNT, NUM_YAWS, FloorPlan, _plans, plan_hypotheses
 from segslam.verification import register
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -32,6 +32,15 @@ def _court(points_per_metre: int = 8) -> Points:
             np.column_stack([x0 + along * (x1 - x0), y0 + along * (y1 - y0), rng.uniform(-1.5, top_m, len(along))])
         )
     return np.concatenate(parts)
+
+
+def test_a_cell_counts_its_points_up_to_a_limit() -> None:
+    in_one, in_another = np.full((3, 3), 0.1), np.full((2 * MAX_COUNT, 3), 5.1)
+    [plan] = _plans(np.concatenate([in_one, in_another]), np.zeros(1))
+    expected = np.zeros_like(plan)
+    expected[HALF, HALF] = 3
+    expected[HALF + int(5.1 / CELL_M), HALF + int(5.1 / CELL_M)] = MAX_COUNT
+    np.testing.assert_array_equal(plan, expected)
 
 
 def _error(found: Registration, T_target_source: Transform) -> tuple[float, float]:

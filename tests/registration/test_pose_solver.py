@@ -13,6 +13,7 @@ from segslam.core import geometry
 from segslam.core.config import SegregatorConfig
 from segslam.core.types import Points, Registration, Rejected, RejectReason, Transform
 from segslam.registration.segregator.pose_solver import (
+    _axis_sigma,
     point_information,
     rotation_between,
     solve_level,
@@ -29,6 +30,11 @@ BOUND_M = 0.2
 def solve(source: Points, target: Points, config: SegregatorConfig | None = None) -> Registration | Rejected:
     found = solve_pose(source, target, bound_m=BOUND_M, config=config or SegregatorConfig())
     return found if isinstance(found, Rejected) else found[1]
+
+
+def test_residuals_of_a_fitted_pose_have_six_degrees_of_freedom_less() -> None:
+    assert _axis_sigma(np.full(4, 0.06), 0.2) == pytest.approx(math.sqrt(0.24 / 6.0))
+    assert _axis_sigma(np.full(4, 1e-6), 0.3) == pytest.approx(0.1)
 
 
 def random_pose(rng: np.random.Generator, rotation: str = "full") -> Transform:

@@ -16,6 +16,10 @@ NUM_HARMONICS = 12
 """Chosen on the real places of KITTI 05: number of harmonics of each circle; their magnitudes are invariant to yaw."""
 NUM_TURNED = 40
 """Chosen: number of the most similar places that are compared at every yaw."""
+SAME_PLACE_M = 4.0
+"""Chosen: scans taken nearer to each other than this show the same: one of them is tried."""
+OTHER_PLACE_M = 10.0
+"""Chosen: scans taken farther from each other than this show different places."""
 
 
 @dataclass(frozen=True, slots=True)

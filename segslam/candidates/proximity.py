@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import ndtr, ndtri
 
+from segslam.candidates.places import SAME_PLACE_M
 from segslam.core import geometry
 from segslam.core.config import ProximityConfig
 from segslam.core.types import REJECTED_WEIGHT, IndexPairs, Indices, LoopCandidate, LoopClosure, Vector
@@ -23,10 +24,8 @@ HEIGHT_M = 1.0
 """Chosen: storeys are 3 m apart: largest height difference of two visits of a place (m)."""
 MAX_CANDIDATES = 2
 """Chosen: number of candidates per keyframe."""
-SPREAD_M = 8.0
-"""Chosen: smallest distance travelled between two candidates of one keyframe (m)."""
-MIN_GAP_M = 8.0
-"""Chosen: distance travelled after an accepted loop before the next search (m)."""
+GAP_M = 2.0 * SAME_PLACE_M
+"""Travel between two loops, and two candidates of a keyframe: a loop joins its place, half of that on either side."""
 
 BREAK_STEP_M = 1e5
 """Travel assigned to a break, because the relative pose across it is unknown."""
@@ -67,7 +66,7 @@ class ProximityDetector:
         *,
         below: int | None = None,
     ) -> tuple[LoopCandidate, ...]:
-        """At most `MAX_CANDIDATES` older keyframes near one, sorted by distance, `SPREAD_M` of travel apart.
+        """At most `MAX_CANDIDATES` older keyframes near one, sorted by distance, `GAP_M` of travel apart.
 
         Row i of the arrays is keyframe i, by the current estimate. Distances are horizontal, because the height of
         LiDAR odometry drifts most; heights separate the storeys of a building. If `below` is given, only smaller ids
@@ -81,17 +80,17 @@ class ProximityDetector:
         nearest_first = np.flatnonzero(is_open)[np.argsort(near.distance_m[is_open], kind="stable")]
         chosen: list[int] = []
         for row in nearest_first.tolist():
-            if len(chosen) < MAX_CANDIDATES and all(abs(travel_m[row] - travel_m[k]) >= SPREAD_M for k in chosen):
+            if len(chosen) < MAX_CANDIDATES and all(abs(travel_m[row] - travel_m[k]) >= GAP_M for k in chosen):
                 chosen.append(row)
         return tuple(near.candidate(row) for row in chosen)
 
     def _is_closed(self, source_id: int, ids: Indices, travel_m: Vector, reach_m: Vector) -> Bool[np.ndarray, " k"]:
-        """True for targets near a loop closed within the last `MIN_GAP_M`: closer to its target, in travel, than
-        `MIN_GAP_M` plus the reach of the search."""
+        """True for targets near a loop closed within the last `GAP_M`: closer to its target, in travel, than
+        `GAP_M` plus the reach of the search."""
         sources, targets = self._closures[self._kept].T
-        recent = targets[np.abs(travel_m[sources] - travel_m[source_id]) < MIN_GAP_M]
+        recent = targets[np.abs(travel_m[sources] - travel_m[source_id]) < GAP_M]
         apart_m = np.abs(travel_m[ids, None] - travel_m[recent])
-        return (apart_m < MIN_GAP_M + reach_m[:, None]).any(axis=1)
+        return (apart_m < GAP_M + reach_m[:, None]).any(axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

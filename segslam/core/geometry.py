@@ -16,7 +16,6 @@ Triple = float | Sequence[float] | np.ndarray
 """Three numbers, or one for all three."""
 Moments = Float[np.ndarray, "4 4"]
 """Means of the products of the homogeneous coordinates of points."""
-_IDENTITY = np.eye(4)
 
 
 def transform(rotation: Rotation, translation: Triple) -> Transform:
@@ -72,13 +71,12 @@ def tangent(*, rotation_rad: Triple, translation_m: Triple) -> Tangent:
 
 def exp(xi: Tangent) -> Transform:
     """The rigid transform of a tangent; inverse of `log`."""
-    theta = float(np.linalg.norm(xi[:3]))
-    twist = np.zeros((4, 4))
-    twist[:3, :3], twist[:3, 3] = _cross(xi[:3]), xi[3:]
-    square = twist @ twist
-    a, b = _series(theta)
-    T_a_b: Transform = _IDENTITY + twist + a * square + b * (square @ twist)
-    return T_a_b
+    phi, rho = xi[:3], xi[3:]
+    theta = float(np.linalg.norm(phi))
+    cross = _cross(phi)
+    # 1 - cos(theta) as a square: exact for small angles
+    a, b = (1.0, 0.5) if theta < 1e-8 else (math.sin(theta) / theta, 2.0 * (math.sin(theta / 2.0) / theta) ** 2)
+    return transform(np.eye(3) + a * cross + b * cross @ cross, _left_jacobian(phi) @ rho)
 
 
 def log(T_a_b: Transform) -> Tangent:
@@ -134,16 +132,13 @@ def nearest_transform(matrix: np.ndarray) -> Transform:
 
 
 def _left_jacobian(phi: np.ndarray) -> Rotation:
+    theta = float(np.linalg.norm(phi))
     cross = _cross(phi)
-    a, b = _series(float(np.linalg.norm(phi)))
+    if theta < 1e-4:  # series: the closed form loses precision here; the next term is below 1e-17
+        return np.eye(3) + cross / 2.0 + cross @ cross / 6.0
+    a = 2.0 * (math.sin(theta / 2.0) / theta) ** 2
+    b = (theta - math.sin(theta)) / theta**3
     return np.eye(3) + a * cross + b * cross @ cross
-
-
-def _series(theta: float) -> tuple[float, float]:
-    """(1 - cos(theta)) / theta^2 and (theta - sin(theta)) / theta^3."""
-    if theta < 1e-4:  # the closed forms lose precision here; the next terms change a transform by less than 1e-17
-        return 0.5, 1.0 / 6.0
-    return 2.0 * (math.sin(theta / 2.0) / theta) ** 2, (theta - math.sin(theta)) / theta**3
 
 
 def _cross(phi: np.ndarray) -> np.ndarray:

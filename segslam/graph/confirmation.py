@@ -8,11 +8,12 @@ keyframes, along some metres of travel, are registered, and their poses are cons
 
 from itertools import compress
 
+from segslam.candidates.places import SAME_PLACE_M
 from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, RejectReason
 from segslam.graph import Graph
 
-MIN_CONSISTENT, MIN_SPREAD_M = 3, 5.0
-"""Chosen: number of keyframes that must be consistent, and travel between the first and the last."""
+MIN_CONSISTENT = 3
+"""Chosen: number of registrations of keyframes that must be consistent, of more than one place."""
 WAITING_M = 40.0
 """Chosen: travel after which an unconfirmed registration is dropped."""
 
@@ -46,7 +47,7 @@ class Confirmation:
         travel_m = self._graph.travel_m
         if (
             len(sources) + 1 < MIN_CONSISTENT
-            or max(abs(travel_m[closure.source_id] - travel_m[source_id]) for source_id in sources) < MIN_SPREAD_M
+            or max(abs(travel_m[closure.source_id] - travel_m[source_id]) for source_id in sources) < SAME_PLACE_M
         ):
             self._waiting.append((candidate, closure))
             shown = f"{len(sources)} of {MIN_CONSISTENT - 1} earlier keyframes confirm it"

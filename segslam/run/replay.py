@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from segslam.candidates.proximity import MIN_GAP_M
+from segslam.candidates.proximity import GAP_M
 from segslam.core.config import Config, ProximityConfig, changed_settings, load_config
 from segslam.core.trajectory import travelled_m
 from segslam.core.types import SegslamError, Vector
@@ -131,10 +131,10 @@ def pairs_near(
     for newer, place in enumerate(east_north_m):
         near = np.array(tree.query_ball_point(place, config.base_radius_m), np.int64)
         near = near[travel_m[near] <= travel_m[newer] - config.min_travel_m]
-        if not len(near) or travel_m[newer] - last_m < MIN_GAP_M:
+        if not len(near) or travel_m[newer] - last_m < GAP_M:
             continue
         older = int(near[np.linalg.norm(east_north_m[near] - place, axis=1).argmin()])
-        is_joined = (np.abs(ends_m - travel_m[[newer, older]]) < MIN_GAP_M + config.base_radius_m).all(axis=1)
+        is_joined = (np.abs(ends_m - travel_m[[newer, older]]) < GAP_M + config.base_radius_m).all(axis=1)
         if not is_joined.any() and (newer, older) not in tried:
             pairs.add((newer, older))
             last_m = travel_m[newer]

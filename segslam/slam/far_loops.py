@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from segslam.candidates import PlaceCandidate, Places, PlaceSignature
+from segslam.candidates.places import OTHER_PLACE_M, SAME_PLACE_M
 from segslam.candidates.proximity import LEAST_PROBABILITY, Nearness, nearness
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch
@@ -17,16 +18,12 @@ from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected
 from segslam.graph import Graph
 from segslam.graph.confirmation import Confirmation
 from segslam.registration.prepared import PreparedScan
-from segslam.slam.recognition import ELSEWHERE_M, recognise
+from segslam.slam.recognition import MAX_PLACES, recognise
 
 MIN_SCORE = 0.6
 """Chosen on the real places of KITTI 05: 97 % of the revisits are more similar, 99 % of other best places less."""
 MOST_DRIFT = 0.25
 """Chosen: largest error of the odometry, as a share of the travel."""
-NUM_LISTED = 5
-"""Chosen: number of the most similar places whose distance is compared with the largest drift of the odometry."""
-RETRY_M = 4.0
-"""Chosen: travel after a rejection until the next attempt, unless a registration waits for confirmation."""
 
 
 class FarLoops:
@@ -88,12 +85,15 @@ class FarLoops:
     def _loop(self, keyframe_id: int, signature: PlaceSignature) -> "_FarLoop | None":
         """With the most similar older place within the largest drift; None if only the search by distance may try."""
         travel_m = self._graph.travel_m
-        if not self._confirmation.is_waiting(keyframe_id) and abs(travel_m[keyframe_id] - self._rejected_m) < RETRY_M:
+        if (
+            not self._confirmation.is_waiting(keyframe_id)
+            and abs(travel_m[keyframe_id] - self._rejected_m) < SAME_PLACE_M
+        ):
             return None
         num_old = int(
             np.searchsorted(travel_m, travel_m[keyframe_id] - self._config.proximity.min_travel_m, side="right")
         )
-        listed = self._places.shortlist(signature, most=NUM_LISTED, below_id=min(num_old, keyframe_id))
+        listed = self._places.shortlist(signature, most=MAX_PLACES, below_id=min(num_old, keyframe_id))
         ids = [
             one.place_id
             for one in listed
@@ -126,8 +126,8 @@ class _FarLoop(NamedTuple):
     def is_left(self) -> bool:
         """True for a place that the search by distance does not try: elsewhere, or near after unknown motions."""
         distance_m = self.candidate.distance_m
-        if distance_m >= ELSEWHERE_M:
-            return distance_m <= self.most_drift_m + ELSEWHERE_M
+        if distance_m >= OTHER_PLACE_M:
+            return distance_m <= self.most_drift_m + OTHER_PLACE_M
         return self.candidate.near_probability < LEAST_PROBABILITY and distance_m <= self.near_m
 
     def __call__(self, T_target_source: Transform, *, slack_m: float) -> Rejected | None:

@@ -11,6 +11,7 @@ from itertools import islice
 import numpy as np
 
 from segslam.candidates import PlaceCandidate
+from segslam.candidates.places import OTHER_PLACE_M, SAME_PLACE_M
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch, at_once
@@ -23,12 +24,8 @@ MAX_PLACES = 6
 """Chosen: number of places tried until one is found; each takes about 100 ms."""
 MAX_RIVALS = 2
 """Chosen: number of other places tried after one is found."""
-SPREAD_M = 4.0
-"""Chosen: candidates nearer than this to a tried one are the same place."""
 NO_PATCHES = np.empty(0, np.int8)
 """The patches of another place are not those of the place found."""
-ELSEWHERE_M = 10.0
-"""Chosen: a candidate farther than this from the found place is another place."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -69,7 +66,7 @@ def recognise(
             rejected = gate_here(T_target_source, slack_m=slack_m)
             if rejected is not None or T_world_found is None:
                 return rejected
-            is_same = _apart_m(T_world_here @ T_target_source, T_world_found) < ELSEWHERE_M
+            is_same = _apart_m(T_world_here @ T_target_source, T_world_found) < OTHER_PLACE_M
             return Rejected(RejectReason.FAR_FROM_PRIOR, "the same place") if is_same else None
 
         return tried_poses(Trial(scan, place, config, allowed, watch))
@@ -82,7 +79,7 @@ def recognise(
 
     rejections = []
     place_ids = [candidate.place_id for candidate in candidates]
-    for place_id in islice(spread(place_ids, T_world_place, SPREAD_M), max_places):
+    for place_id in islice(spread(place_ids, T_world_place, SAME_PLACE_M), max_places):
         found = tried(place_id)
         if isinstance(found, Rejected):
             rejections.append(found)
@@ -92,7 +89,7 @@ def recognise(
             rejections.append(outcome)
             continue
         T_world_lidar = T_world_place(place_id) @ found[0].T_target_source
-        others = list(islice(spread(place_ids, T_world_place, ELSEWHERE_M, [T_world_lidar]), MAX_RIVALS))
+        others = list(islice(spread(place_ids, T_world_place, OTHER_PLACE_M, [T_world_lidar]), MAX_RIVALS))
         halves = at_once(*(partial(found_elsewhere, T_world_lidar, half) for half in (others[0::2], others[1::2])))
         outcome = judged(found[0], [*found[1:], *halves[0], *halves[1]], config=config)
         return outcome if isinstance(outcome, Rejected) else Recognised(place_id, T_world_lidar, outcome)

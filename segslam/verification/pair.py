@@ -23,10 +23,7 @@ from segslam.labels import geometric_labels
 from segslam.registration import refinement
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification.rivals import is_same, rivals_of
-from segslam.verification.trial import EQUAL_M, EQUAL_RAD, MAX_COARSE_FINE_M, Found, Gate, Trial, anywhere, judged
-
-KNOWN_M, KNOWN_RAD = 1.0, math.radians(3.0)
-"""Chosen: largest error of a known pose. A rival this near is mostly the same pose (`rivals.SAME_POSE_M`)."""
+from segslam.verification.trial import MAX_COARSE_FINE_M, Found, Gate, Trial, anywhere, judged
 
 
 def register(
@@ -106,7 +103,7 @@ def tried_poses(trial: Trial) -> list[Found] | Rejected:
             if isinstance(pose, Found) and trial.gate(pose.T_target_source, slack_m=0.0) is None
         ]
         best = max(allowed, key=lambda pose: pose.mean_ratio)
-    return [best, *(pose for pose in found if not is_same(pose.T_target_source, best))]
+    return [best, *(pose for pose in found if not is_same(pose.T_target_source, best.T_target_source))]
 
 
 def _outcome(trial: Trial, coarse: Registration, found: Sequence[Found]) -> Found | Rejected | None:
@@ -114,7 +111,7 @@ def _outcome(trial: Trial, coarse: Registration, found: Sequence[Found]) -> Foun
     begun = trial.begin(coarse)
     if isinstance(begun, Rejected):
         return begun
-    if geometry.is_near(begun, [pose.T_target_source for pose in found], within_m=EQUAL_M, within_rad=EQUAL_RAD):
+    if refinement.is_near(begun, [pose.T_target_source for pose in found]):
         return None
     outcome = trial.refined(coarse, begun)
     if isinstance(outcome, Found):
@@ -127,17 +124,17 @@ def _outcome(trial: Trial, coarse: Registration, found: Sequence[Found]) -> Foun
 def register_near(
     source: PreparedScan, target: PreparedScan, T_target_source: Transform, *, config: Config, watch: Stopwatch
 ) -> Alignment | Rejected:
-    """The refined and verified pose near one that is known to `KNOWN_M` and `KNOWN_RAD`; no other poses are tried.
+    """The refined and verified pose near a known one; no other poses are tried.
 
-    Rejects FAR_FROM_PRIOR if refinement moves the pose farther.
+    Rejects FAR_FROM_PRIOR if refinement leads to another pose (`is_same`).
     """
     trial = Trial(source, target, config, anywhere, watch)
     with watch("refine"):
         fine = refinement.refine(source.surface, target.surface, T_target_source, config=config.refine)
     if isinstance(fine, Rejected):
         return fine
-    moved = geometry.inverse(T_target_source) @ fine.T_target_source
-    if geometry.distance(moved) > KNOWN_M or geometry.angle(moved) > KNOWN_RAD:
+    if not is_same(T_target_source, fine.T_target_source):
+        moved = geometry.inverse(T_target_source) @ fine.T_target_source
         detail = f"moved {geometry.distance(moved):.2f} m, {math.degrees(geometry.angle(moved)):.1f} degrees"
         return Rejected(RejectReason.FAR_FROM_PRIOR, detail)
     coarse = replace(fine, T_target_source=T_target_source, num_inliers=0, num_correspondences=0)

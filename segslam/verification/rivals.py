@@ -13,9 +13,6 @@ from segslam.registration import refinement
 from segslam.verification import score
 from segslam.verification.trial import Found, Trial, anywhere, few_points
 
-MAX_RIVALS = 6
-"""Chosen: number of floor-plan poses tried as rivals, besides shifts along the weak direction."""
-
 MOST_SHIFT_M = 8
 """Chosen: largest shift along the weak direction at which rivals are searched, in steps of 1 m; refinement finds rivals
 within 0.5 m."""
@@ -24,8 +21,6 @@ FEW_LEAD, APPROACH_LEAD = 2.0, 4.0
 than matters, after a refinement with few points and after its first iterations."""
 MOST_RIVALS = 4
 """Chosen: number of rivals that are refined with all points, those over which the found pose leads least."""
-NEW_M, NEW_RAD = 0.3, math.radians(1.0)
-"""Chosen: few points that lead this close to another pose end with all points where it does."""
 SAME_POSE_M, SAME_POSE_RAD = 0.75, math.radians(5.0)
 """Chosen: poses closer to each other than this are the same."""
 
@@ -40,7 +35,7 @@ def rivals_of(found: Found, known: Sequence[Found], trial: Trial) -> list[Found]
     done = [pose.T_target_source for pose in known]
     starts: list[_Start] = []
     for start in sorted(_starts(found, free), key=lambda start: start.lead):
-        if not geometry.is_near(start.coarse.T_target_source, done, within_m=NEW_M, within_rad=NEW_RAD):
+        if not refinement.is_near(start.coarse.T_target_source, done):
             done.append(start.coarse.T_target_source)
             starts.append(start)
     refined = [  # where the scans let a pose slide, a rival need not converge to fit as well
@@ -49,10 +44,9 @@ def rivals_of(found: Found, known: Sequence[Found], trial: Trial) -> list[Found]
     return [rival for rival in refined if isinstance(rival, Found)]
 
 
-def is_same(T_target_source: Transform, found: Found) -> bool:
-    """True if a pose is so close to a found one that they are the same."""
-    near = [found.T_target_source]
-    return geometry.is_near(T_target_source, near, within_m=SAME_POSE_M, within_rad=SAME_POSE_RAD)
+def is_same(T_target_source: Transform, T_target_other: Transform) -> bool:
+    """True if two poses are so close that they are the same."""
+    return geometry.is_near(T_target_source, [T_target_other], within_m=SAME_POSE_M, within_rad=SAME_POSE_RAD)
 
 
 class _Start(NamedTuple):
@@ -67,9 +61,11 @@ def _starts(found: Found, trial: Trial) -> list[_Start]:
     """Poses to which few points lead from shifts along the weak direction, and from floor plans."""
     weakest = refinement.weakest_level(found.fine.information)
     shifted = [start for sign in (-1.0, 1.0) for start in _shifted(found, sign * weakest, trial)]
-    plans = [_led(coarse, found, trial) for coarse in trial.plans_near(MAX_RIVALS)]
+    plans = [_led(coarse, found, trial) for coarse in trial.plans_near()]
     return [
-        start for start in (*shifted, *plans) if start is not None and not is_same(start.coarse.T_target_source, found)
+        start
+        for start in (*shifted, *plans)
+        if start is not None and not is_same(start.coarse.T_target_source, found.T_target_source)
     ]
 
 
@@ -80,7 +76,7 @@ def _led(coarse: Registration, found: Found, trial: Trial) -> _Start | None:
         return None
     with trial.watch("refine"):
         T_begun = refinement.approach(*surfaces, coarse.T_target_source, config=trial.config.refine)
-    if is_same(T_begun, found):
+    if is_same(T_begun, found.T_target_source):
         return _Start(replace(coarse, T_target_source=T_begun), 0.0)
     most = score.shipped().most_lead(found.agreement.counts, trial.least_odds)
     if _lead(found, T_begun, trial) > most + APPROACH_LEAD:

@@ -3,7 +3,6 @@
 It is refined with few points, then with all; then it is judged by what the scans show there.
 """
 
-import math
 from collections.abc import Iterator, Sequence
 from copy import copy
 from functools import lru_cache
@@ -21,7 +20,7 @@ from segslam.verification import patches, score
 MAX_HYPOTHESES = 3
 """Chosen: number of coarse poses tried, the best first."""
 MAX_PLAN_HYPOTHESES = 6
-"""Chosen: number of poses tried after these, from aligning the two floor plans."""
+"""Chosen: number of poses tried after these, and of rivals of a found pose, from aligning the two floor plans."""
 MAX_COARSE_FINE_M = 2.0
 """Chosen: largest correction of a coarse pose by refinement (m)."""
 
@@ -46,8 +45,6 @@ FEW_NATS = 4.0
 """Chosen: a pose is not refined further if its log odds, by the patches of one scan after a refinement with few points
 and without other poses, are more than this below the least odds of an accepted pose. Of 316 right poses (scenes, KITTI
 00, courtyard) none was more than 0.6 below; with 2 instead one hypothesis of 60 pairs of KITTI 00 is lost."""
-EQUAL_M, EQUAL_RAD = 0.1, math.radians(0.5)
-"""Chosen: a hypothesis is not refined with all points if few points lead it this close to where another was refined."""
 
 
 @runtime_checkable
@@ -134,13 +131,13 @@ class Trial(NamedTuple):
         else:
             possible = [coarse for coarse in ranked if self._excluded(coarse) is None]
             yield from (possible or ranked[:1])[:MAX_HYPOTHESES]
-        yield from self.plans_near(MAX_PLAN_HYPOTHESES)
+        yield from self.plans_near()
 
-    def plans_near(self, num_poses: int) -> list[Registration]:
-        """Poses near the prior that align the two floor plans."""
+    def plans_near(self) -> list[Registration]:
+        """Poses near the prior that align the two floor plans, at most `MAX_PLAN_HYPOTHESES`."""
         with self.watch("match"):
             ranked = copy(_ranked_plans(self.source, self.target))
-            return list(islice((coarse for coarse in ranked if self._excluded(coarse) is None), num_poses))
+            return list(islice((coarse for coarse in ranked if self._excluded(coarse) is None), MAX_PLAN_HYPOTHESES))
 
     def _excluded(self, coarse: Registration) -> Rejected | None:
         return self.gate(coarse.T_target_source, slack_m=MAX_COARSE_FINE_M)

@@ -21,8 +21,7 @@ ROUND = 100
 def _dense_square(monkeypatch: pytest.MonkeyPatch) -> None:
     """More candidates, nearer to each other, than in a drive."""
     monkeypatch.setattr(proximity, "MAX_CANDIDATES", 3)
-    monkeypatch.setattr(proximity, "SPREAD_M", 6.0)
-    monkeypatch.setattr(proximity, "MIN_GAP_M", 4.0)
+    monkeypatch.setattr(proximity, "GAP_M", 6.0)
 
 
 def square(num: int) -> tuple[np.ndarray, np.ndarray]:
@@ -146,8 +145,8 @@ def test_where_a_loop_was_just_closed_no_other_is_searched() -> None:
     poses, travel = square(ROUND + 20)
     detector = ProximityDetector(CONFIG)
     detector.note_closure(closure(ROUND + 12, 12))
-    assert detector.candidates(ROUND + 13, poses, travel, CERTAIN) == (), "2 m on, the same visit"
-    assert detector.candidates(ROUND + 14, poses, travel, CERTAIN), "4 m on"
+    assert detector.candidates(ROUND + 14, poses, travel, CERTAIN) == (), "4 m on, the same visit"
+    assert detector.candidates(ROUND + 15, poses, travel, CERTAIN), "6 m on"
 
 
 def test_a_loop_just_closed_with_one_visit_does_not_stop_the_search_of_another() -> None:

@@ -7,7 +7,7 @@ import pytest
 from helpers.commands import run
 from helpers.finished_run import make_run
 
-from segslam.candidates.proximity import MIN_GAP_M
+from segslam.candidates.proximity import GAP_M
 from segslam.core.config import ProximityConfig
 from segslam.run.replay import pairs_near
 
@@ -32,14 +32,14 @@ def test_each_place_of_the_second_round_is_paired_with_the_first() -> None:
     pairs = sorted(_pairs(1.0, []))
     assert {newer - older for newer, older in pairs[1:]} == {ROUND}
     assert pairs[0] == (ROUND - 3, 0), "the circle closes before the second round begins"
-    assert set(np.diff([newer for newer, _ in pairs]) * SPACING_M) == {MIN_GAP_M}
+    assert set(np.diff([newer for newer, _ in pairs]) * SPACING_M) == {GAP_M}
     elsewhere = _pairs(ProximityConfig().base_radius_m + 1.0, [])
     assert elsewhere == {(ROUND - 3, 0), (2 * ROUND - 2, ROUND)}, "the second round is another street"
 
 
 def test_places_that_a_loop_joins_and_pairs_that_were_tried_are_left_out() -> None:
     joined = _pairs(1.0, [(ROUND + 50, 50)])
-    assert all(abs(newer - ROUND - 50) * SPACING_M >= MIN_GAP_M for newer, _ in joined)
+    assert all(abs(newer - ROUND - 50) * SPACING_M >= GAP_M for newer, _ in joined)
     assert 0 < len(joined) < len(_pairs(1.0, []))
     first = min(_pairs(1.0, []))
     assert first not in _pairs(1.0, [], tried=[first])

@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from segslam.core import geometry
 from segslam.core.config import SegregatorConfig
 from segslam.core.types import Description, Direction, Indices, Points, Registration, Rejected, RejectReason, Transform
+from segslam.registration import refinement
 from segslam.registration.cliques import maximum_cliques
 from segslam.registration.segregator.consistency_graph import consistency_graph
 from segslam.registration.segregator.correspondences import Correspondences, feature_pairs
@@ -26,8 +26,6 @@ CLIQUE_MAX_NODES = 200_000
 CERTAIN_INLIERS = 12
 """Chosen on simulated 00 and 08: number of inliers above which a pose is certain and no other is tried."""
 
-SAME_PLACE_M, SAME_TURN_RAD = 0.5, np.radians(2.0)
-"""Chosen: closer poses are one hypothesis, because refinement leads to the same pose."""
 MIN_GROUND_PATCHES = 5
 """Chosen: smallest number of ground patches that determine the vertical."""
 TILT_RAD = math.radians(5.0)
@@ -64,11 +62,7 @@ def hypotheses(source: Description, target: Description, *, config: SegregatorCo
         return rejections[0]
     ranked = [registration for _, registration in sorted(found, key=lambda attempt: -attempt[0])]
     poses = [registration.T_target_source for registration in ranked]
-    return [
-        registration
-        for k, registration in enumerate(ranked)
-        if not geometry.is_near(poses[k], poses[:k], within_m=SAME_PLACE_M, within_rad=SAME_TURN_RAD)
-    ]
+    return [registration for k, registration in enumerate(ranked) if not refinement.is_near(poses[k], poses[:k])]
 
 
 def _attempts(source: Description, target: Description, config: SegregatorConfig) -> Iterator[Scored | Rejected]:

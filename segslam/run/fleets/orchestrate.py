@@ -13,13 +13,14 @@ from typing import Any
 from segslam.core.threads import Stopwatch
 from segslam.core.types import SegslamError, WorkFailed
 from segslam.core.whole_files import expanded, write_whole
+from segslam.graph.confirmation import MIN_CONSISTENT
 from segslam.output.folder import not_writable
 from segslam.run.fleets import steps
 from segslam.run.fleets.drives import Drive, drives_of, read_drives
 from segslam.run.fleets.relations import Components
 from segslam.run.fleets.steps import Mapped
 from segslam.run.fleets.workers import Outcome, Workers, workers
-from segslam.run.sessions.session_pose import MIN_FOUND, Relation
+from segslam.run.sessions.session_pose import Relation
 from segslam.slam.adjustment import Progress, no_progress
 
 logger = logging.getLogger(__name__)
@@ -172,7 +173,7 @@ class _Fleet:
     ) -> Components:
         """The most similar pairs of drives are related first, until all are joined or tried."""
         components = Components(len(mapped))
-        similarity = {pair: sum(score for _, score in likely[:MIN_FOUND]) for pair, likely in proposals.items()}
+        similarity = {pair: sum(score for _, score in likely[:MIN_CONSISTENT]) for pair, likely in proposals.items()}
         while pairs := components.next_pairs(similarity):
             tasks = []
             for later, earlier in pairs:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from segslam.candidates.places import OTHER_PLACE_M
 from segslam.candidates.proximity import BREAK_STEP_M
 from segslam.core import geometry
 from segslam.core.config import Config, check_config
@@ -29,8 +30,6 @@ from segslam.slam.slam import Slam
 
 OPTIMIZE_EVERY = 25
 """Chosen: number of keyframes of a later session between two optimisations; odometry drifts little over 50 m."""
-SEARCH_EVERY_M = 12.0
-"""Chosen: travel between two keyframes of a later session for which loops with earlier sessions are searched."""
 GAP_NS = 1_000_000_000
 """Chosen: pause inserted before the first scan of a session that is not later than the previous session."""
 StepToTake = tuple[Step, int, bool]
@@ -98,7 +97,7 @@ class Merged:
                 if step.keyframe is not None:
                     number = step.keyframe.id - first_id
                     optimize = number == last_id or (session.found is not None and number % OPTIMIZE_EVERY == 0)
-                    if is_new and step.keyframe.travel_m - searched_m >= SEARCH_EVERY_M:
+                    if is_new and step.keyframe.travel_m - searched_m >= OTHER_PLACE_M:
                         below, searched_m = first_id, step.keyframe.travel_m
                 yield step, below, optimize
 

@@ -13,31 +13,24 @@ from itertools import islice
 
 import numpy as np
 
-from segslam.candidates.proximity import BREAK_TRAVEL_M
+from segslam.candidates.places import OTHER_PLACE_M, SAME_PLACE_M
+from segslam.candidates.proximity import BREAK_TRAVEL_M, MAX_CANDIDATES
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch
 from segslam.core.types import LoopCandidate, Placement, Rejected, RejectReason, Transform
 from segslam.graph import AnchoredGraph
 from segslam.graph.chains import far_from_prior
+from segslam.graph.confirmation import WAITING_M
 from segslam.keyframes import Submaps
 from segslam.registration import refinement
 from segslam.registration.prepared import Observed, prepare_observed
 from segslam.run.locator import Locator
 from segslam.slam.recognition import spread
+from segslam.slam.slam_result import TRUSTED_M
 from segslam.verification.patches import agreement
 from segslam.verification.trial import MAX_COARSE_FINE_M, Found, judged
 
-REACH_M = 12.0
-"""Chosen: the map's keyframes within this distance of a prediction are used for registration."""
-NUM_TRIED, APART_M = 2, 4.0
-"""Chosen: largest number of these, nearest first, and smallest distance between them."""
-SEARCH_AFTER_M = 20.0
-"""Chosen: travel without a placement after which the place is searched without initial guess."""
-SEARCH_EVERY_M = 4.0
-"""Chosen: travel between two such searches, each of which takes some tenths of a second."""
-REMEMBERED_M = 60.0
-"""Chosen: travel within which a second location must be found."""
 NUM_PREPARED = 64
 
 
@@ -65,7 +58,7 @@ class Placer:
             if isinstance(tracked, Placement):
                 return self._taken((tracked,)), None
             why = tracked
-        if since_m < SEARCH_AFTER_M or travel_m[keyframe_id] - self._searched_m < SEARCH_EVERY_M:
+        if since_m < TRUSTED_M or travel_m[keyframe_id] - self._searched_m < SAME_PLACE_M:
             return (), why
         self._searched_m = travel_m[keyframe_id]
         with watch("locate"):
@@ -85,8 +78,8 @@ class Placer:
         outcome: Placement | Rejected = Rejected(RejectReason.NO_PLACE, f"{apart_m.min():.0f} m from the map")
         with watch("prepare"):
             own = self._seen(self._submaps, keyframe_id)
-        near = [number for number in np.argsort(apart_m)[: 10 * NUM_TRIED].tolist() if apart_m[number] <= REACH_M]
-        for target_id in islice(spread(near, self._T_world_map.__getitem__, APART_M), NUM_TRIED):
+        near = np.argsort(apart_m)[: np.count_nonzero(apart_m <= OTHER_PLACE_M)].tolist()
+        for target_id in islice(spread(near, self._T_world_map.__getitem__, SAME_PLACE_M), MAX_CANDIDATES):
             outcome = self._registered(keyframe_id, own, target_id, T_world_predicted, watch)
             if isinstance(outcome, Placement):
                 break
@@ -126,7 +119,7 @@ class Placer:
         if self._last is not None and self._agree(self._last, found, BREAK_TRAVEL_M):
             return self._taken((found,)), None
         for earlier in reversed(self._found):
-            if self._agree(earlier, found, REMEMBERED_M):
+            if self._agree(earlier, found, WAITING_M):
                 return self._taken((earlier, found)), None
         self._found.append(found)
         return (), Rejected(RejectReason.UNCONFIRMED, "found, but not yet confirmed by another keyframe")

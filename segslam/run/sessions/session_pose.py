@@ -10,12 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from segslam.candidates.places import OTHER_PLACE_M
 from segslam.candidates.proximity import BREAK_STEP_M
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
 from segslam.graph import PoseGraph
 from segslam.graph.closure_pairs import largest_consistent
+from segslam.graph.confirmation import MIN_CONSISTENT
 from segslam.run.locator import Locator, submaps_of
 from segslam.run.sessions.recorded import FIRST_MOTION, Session, shifted
 from segslam.slam.adjustment import Progress, no_progress
@@ -23,13 +25,9 @@ from segslam.slam.recognition import MAX_PLACES
 
 NUM_QUERIES = 60
 """Chosen: number of keyframes of a session that are searched in another, spread over its travel."""
-MIN_FOUND = 3
-"""Chosen: smallest number of consistent locations that relate two sessions; further loops are found by proximity."""
 MOST_FAILED = 4
 """Chosen on two fleets: the search for the pose of a session ends when so many of its likely keyframes, the first ones,
 were not found; in each of 16 pairs of drives that share places the first was, at the place that it looks like most."""
-MIN_SPREAD_M = 10.0
-"""Chosen: smallest travel between the first and the last of them; a single place may be a wrong one."""
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 """Golden ratio less 1: steps of it, modulo 1, are spread evenly at any number."""
 
@@ -54,10 +52,10 @@ def find_session(
 ) -> Relation:
     """The pose of a session in an earlier one, that of the locator.
 
-    Keyframes are searched until `MIN_FOUND` consistent ones, `MIN_SPREAD_M` apart, are found: at most `NUM_QUERIES`,
-    spread over the session; sparse ones together with their neighbours. `likely`: these keyframes are searched instead,
-    in this order, and those before and after each that is found, until the first `MOST_FAILED` were not. They look like
-    a place of the earlier session, and no other place is tried.
+    Keyframes are searched until `MIN_CONSISTENT` consistent ones, `OTHER_PLACE_M` apart, are found: at most
+    `NUM_QUERIES`, spread over the session; sparse ones together with their neighbours. `likely`: these keyframes are
+    searched instead, in this order, and those before and after each that is found, until the first `MOST_FAILED` were
+    not. They look like a place of the earlier session, and no other place is tried.
     """
     count = len(session.travel_m)
     submaps = submaps_of(session, config)
@@ -79,9 +77,9 @@ def find_session(
         if _is_enough(kept, session) or (likely is not None and not found and num_tried == MOST_FAILED):
             break
     if not _is_enough(kept, session):
-        why = f"{MIN_FOUND} are needed"
-        if len(found) >= MIN_FOUND:
-            why = f"but no {MIN_FOUND} of them, {MIN_SPREAD_M:g} m apart, are consistent with the odometry"
+        why = f"{MIN_CONSISTENT} are needed"
+        if len(found) >= MIN_CONSISTENT:
+            why = f"but no {MIN_CONSISTENT} of them, {OTHER_PLACE_M:g} m apart, are consistent with the odometry"
         return Relation(None, (), f"{len(found)} of {num_tried} keyframes were found there, {why}")
     for one in kept:
         graph.add_closure(shifted(one, first_id, 0))
@@ -92,7 +90,8 @@ def find_session(
 
 def _is_enough(kept: Sequence[LoopClosure], session: Session) -> bool:
     """True if consistent locations of keyframes determine the pose of their session."""
-    return len(kept) >= MIN_FOUND and bool(np.ptp(session.travel_m[[one.source_id for one in kept]]) >= MIN_SPREAD_M)
+    travel_m = session.travel_m[[one.source_id for one in kept]]
+    return len(kept) >= MIN_CONSISTENT and bool(np.ptp(travel_m) >= OTHER_PLACE_M)
 
 
 def _spread(count: int) -> list[int]:

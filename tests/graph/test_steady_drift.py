@@ -71,6 +71,21 @@ def test_a_large_steady_drift_leaves_hardly_more_error_than_a_small_one(rad_per_
     assert set(graph.finish().closure_weights.values()) == {1.0}
 
 
+def test_a_drift_by_time_has_no_rate_by_travel(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+
+    def noted(*about: object, tolerated: float) -> steady_drift.SteadyDrift | None:
+        found.append(steady_drift.steady_drift(*about, tolerated=tolerated))
+        return found[-1]
+
+    monkeypatch.setattr(graph_module, "steady_drift", noted)
+    mapped_ate_m(0.0, 6e-3)
+    [drift] = found
+    assert drift is not None
+    np.testing.assert_allclose(drift.turns[:, 2], -6e-3 * np.diff(block()[1]), rtol=0.02)
+    np.testing.assert_allclose(drift.turns[:, 2] / np.diff(block()[1]), drift.turns[0, 2] / block()[1][1], rtol=1e-7)
+
+
 def test_a_random_drift_is_not_taken_for_a_steady_one(monkeypatch: pytest.MonkeyPatch) -> None:
     _, with_it, _ = mapped_ate_m(0.0, 0.0, walk=0.002)
     monkeypatch.setattr(graph_module, "steady_drift", lambda *about, tolerated: None)

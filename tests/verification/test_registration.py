@@ -14,9 +14,9 @@ from segslam.registration import refinement, segregator
 from segslam.registration.free_space import observe_free_space
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.scans import open_dataset
-from segslam.verification import register, register_near, register_prepared, rivals
+from segslam.verification import patches, register, register_near, register_prepared, rivals, score
 from segslam.verification.pair import tried_poses
-from segslam.verification.trial import MAX_COARSE_FINE_M, MAX_HYPOTHESES, Found, Trial, anywhere
+from segslam.verification.trial import FEW_NATS, MAX_COARSE_FINE_M, MAX_HYPOTHESES, Found, Trial, anywhere
 from tools.benchmarks.altered import ALTERATIONS
 
 CONFIG = Config()
@@ -103,6 +103,25 @@ def test_poses_that_the_prior_excludes_do_not_use_up_the_attempts(monkeypatch: p
         return Rejected(RejectReason.FAR_FROM_PRIOR) if turn_deg > 20.0 else None
 
     assert isinstance(register_prepared(source, target, config=CONFIG, gate=gate), Alignment)
+
+
+def test_in_a_first_look_the_patches_of_the_source_stand_for_those_of_the_target(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    source, target, _ = _round_pair()
+    (coarse, *_) = segregator.hypotheses(source.description, target.description, config=CONFIG.segregator)
+    trial = Trial(source, target, CONFIG, anywhere, Stopwatch())
+    least = trial.least_odds - FEW_NATS
+
+    def odds(num_fitting: int) -> float:
+        return score.shipped().log_odds(patches.counted(np.full(num_fitting, patches.RESIDUAL, np.int8)))
+
+    enough = next(number for number in range(1, 400) if odds(2 * number) >= least)
+    assert odds(enough) < least
+    for number, is_hopeless in ((enough - 1, True), (enough, False)):
+        shown = np.full(number, patches.RESIDUAL, np.int8)
+        monkeypatch.setattr(Trial, "first_look", lambda self, T_target_source, shown=shown: shown)
+        assert isinstance(trial.begin(coarse), Rejected) is is_hopeless
 
 
 def test_poses_that_the_prior_excludes_are_rivals() -> None:

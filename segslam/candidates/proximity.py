@@ -25,7 +25,7 @@ HEIGHT_M = 1.0
 MAX_CANDIDATES = 2
 """Chosen: number of candidates per keyframe."""
 GAP_M = 2.0 * SAME_PLACE_M
-"""Travel between two loops, and two candidates of a keyframe: a loop joins its place, half of that on either side."""
+"""Chosen: travel between two loops, and between two candidates of a keyframe: every second place."""
 
 BREAK_STEP_M = 1e5
 """Travel assigned to a break, because the relative pose across it is unknown."""

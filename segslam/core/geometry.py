@@ -136,7 +136,7 @@ def _left_jacobian(phi: np.ndarray) -> Rotation:
     cross = _cross(phi)
     if theta < 1e-4:  # series: the closed form loses precision here; the next term is below 1e-17
         return np.eye(3) + cross / 2.0 + cross @ cross / 6.0
-    a = 2.0 * (math.sin(theta / 2.0) / theta) ** 2
+    a = 2.0 * (math.sin(theta / 2.0) / theta) ** 2  # 1 - cos(theta) as a square, as in `exp`
     b = (theta - math.sin(theta)) / theta**3
     return np.eye(3) + a * cross + b * cross @ cross
 
@@ -190,12 +190,15 @@ def chance_beyond(reach_m: float, covariance: Information) -> float:
 
 
 def moments_of(points: Points) -> Moments:
-    """Those of points (n, 3)."""
+    """The moments of points (n, 3), for `displacement_m`."""
     homogeneous = np.column_stack([points, np.ones(len(points))])
     return homogeneous.T @ homogeneous / len(points)
 
 
 def displacement_m(moments: Moments, T_a_points: Transform, T_a_other: Transform) -> float:
-    """Root mean square distance between points at two poses: one figure for translation and rotation."""
+    """Root mean square distance (m) between points at two poses: one figure for translation and rotation.
+
+    `moments` of the points in their own frame.
+    """
     apart = (T_a_points - T_a_other)[:3]
     return math.sqrt(max(float(np.vdot(apart @ moments, apart)), 0.0))

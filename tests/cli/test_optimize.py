@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from segslam.core import geometry
 from segslam.core.types import SegslamError
+from segslam.graph import batch_search
 from segslam.graph.batch import optimize_graph
 from segslam.graph.edges import Edge, factor_graph
 from segslam.graph.g2o import G2oGraph, read_g2o, write_g2o
@@ -109,6 +110,19 @@ def test_a_group_of_false_edges_that_are_consistent_with_each_other_is_rejected(
     found = optimize_graph(G2oGraph(graph.T_world_vertex, graph.edges + false))
     np.testing.assert_allclose(poses(found.graph), truth, atol=1e-4)
     assert found.outliers == tuple((edge.a, edge.b) for edge in false)
+
+
+def test_pairs_of_closures_are_compared_up_to_a_number_and_more_are_told_by_graduated_non_convexity(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    graph, truth = square(num_false=4)
+    for most, told in ((12, False), (11, True)):
+        caplog.clear()
+        monkeypatch.setattr(batch_search, "MAX_PAIRED", most)
+        found = optimize_graph(graph)
+        np.testing.assert_allclose(poses(found.graph), truth, atol=1e-4)
+        assert ("graduated non-convexity" in caplog.text) is told
 
 
 def test_odometry_may_be_written_backwards_twice_and_from_any_id() -> None:

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from segslam.core import geometry
-from segslam.core.config import GraphConfig
+from segslam.core.config import Config, GraphConfig
 from segslam.core.types import LoopCandidate, Rejected, RejectReason
-from segslam.graph.chains import Chains, _length, far_from_prior
+from segslam.graph.chains import Chains, _length, far_from_prior, prior_gate
 from segslam.graph.closure_pairs import adjoints
 from segslam.graph.edges import Edge
 from segslam.graph.noise import TURN_M, UNKNOWN_MOTION, odometry_information
@@ -148,3 +148,14 @@ def test_a_pose_that_an_uncertain_prior_allows_is_excluded_by_a_certain_one() ->
     moved = geometry.transform(np.eye(3), [0.0, 3.0, 0.0])
     assert outcome(moved, sigma_m=0.3) is None
     assert outcome(moved, sigma_m=0.1) is not None
+
+
+@pytest.mark.parametrize("away_m", [5.0, 7.0, 9.0])
+def test_a_pose_is_excluded_beyond_the_radius_and_what_refinement_may_move_it(away_m: float) -> None:
+    certain = LoopCandidate(1, 0, np.eye(4), 5.0, np.eye(6) * 1e-8)
+    config = Config()
+    assert config.proximity.base_radius_m == 6.0
+    pose = geometry.transform(np.eye(3), [0.0, away_m, 0.0])
+    gate = prior_gate(certain, config)
+    assert (gate(pose, slack_m=0.0) is None) is (away_m < 6.0)
+    assert (gate(pose, slack_m=2.0) is None) is (away_m < 8.0)

@@ -4,9 +4,11 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
+import pytest
 
 from segslam.core import geometry
 from segslam.core.config import GraphConfig
+from segslam.graph import gnc
 from segslam.graph.closure_pairs import consistent_pairs, largest_consistent, neighbours
 from segslam.graph.edges import Edge, factor_graph
 from segslam.graph.gnc import TruncatedProblem, select_consistent, settle, settle_from
@@ -78,3 +80,24 @@ def test_without_closures_odometry_is_left_alone() -> None:
 def test_a_group_of_two_changes_nothing() -> None:
     problem, truth, agree, near = problem_of([*TRUE, *FALSE[:2]])
     assert select_consistent(problem, truth, agree, near).truncated_cost <= settle(problem, truth).truncated_cost
+
+
+def test_the_inliers_that_are_consistent_with_a_rejected_group_stay_while_it_is_tried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One that lies between the two groups is consistent with both."""
+    problem, truth, agree, near = problem_of([*TRUE, *FALSE, closure(155, 6.0)])
+    misled = settle_from(problem, truth, largest_consistent(agree))
+    inliers = misled.weights > 0.0
+    group = largest_consistent(agree & near, ~inliers)
+    assert not agree[:, group].mean(axis=1)[inliers].all(), "else all of them would stay"
+    assert agree[:, group].all(axis=1)[inliers].any(), "else none would"
+    tried = []
+
+    def recorded(*arguments: object) -> gnc.Solution:
+        tried.append(arguments[2])
+        return settle_from(*arguments)
+
+    monkeypatch.setattr(gnc, "settle_from", recorded)
+    gnc.exchange_groups(problem, misled, agree, near)
+    assert tried[0].tolist() == (group | inliers & (agree[:, group].mean(axis=1) >= 0.9)).tolist()

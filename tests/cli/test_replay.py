@@ -58,7 +58,8 @@ def test_other_settings_change_the_loops_and_the_change_is_printed(
     assert run("replay", log, "--out", out, "--config", strict) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["num_loops_lost"] > 0
-    output = f"{metrics['num_loops_won']} loops more, {metrics['num_loops_lost']} fewer"
+    won = metrics["num_loops_won"]
+    output = f"{won} loop{'' if won == 1 else 's'} more, {metrics['num_loops_lost']} fewer"
     assert output in capsys.readouterr().err
     settings = read_log(out / "log.mcap").config
     assert settings.verify.max_false_share == pytest.approx(share)

@@ -258,14 +258,20 @@ def _experiment(
     job = _make_job(data, options, changes, terminal)
     from segslam.bench.experiments.benchmark import in_order, run
     from segslam.bench.experiments.job import open_once
-    from segslam.bench.experiments.pairs import PAPER_PAIR, pair_trials
+    from segslam.bench.experiments.pairs import PAPER_PAIR, pair_trials, scans_named
     from segslam.bench.experiments.paper import with_paper_values
     from segslam.bench.experiments.provenance import account
     from segslam.bench.experiments.report_tables import overall, plain
     from segslam.bench.experiments.rows import results, write_rows
 
-    reference = open_once(job.source)[0].reference
+    scans, row_of_scan = open_once(job.source)
+    reference = scans.reference
     lists = _read_lists(options, reference, default=PAPER_PAIR if varied else None)
+    if missing := sorted(scans_named(lists) - row_of_scan.keys()):
+        raise SegslamError(
+            f"{data}: scan {missing[0]} has no file, nor have {len(missing) - 1} other scans of the pairs; put them "
+            "there, or give a list whose scans are all there"
+        )
     trials = [trial for one in lists for trial in pair_trials(one, reference, **varied)]
     terminal.compile_kernels()
     rows: list[Row] = []

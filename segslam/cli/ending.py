@@ -105,8 +105,8 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
     if "num_loops_won" in metrics:
         before = f"; error of the logged run: {metrics['recorded_ate_m']:.3f} m" if "recorded_ate_m" in metrics else ""
         lines.append(
-            f"against the logged run: {counted(metrics['num_loops_won'], 'loop')} more, {metrics['num_loops_lost']} fewer"
-            f"{before}"
+            f"against the logged run: {counted(metrics['num_loops_won'], 'loop')} more, "
+            f"{metrics['num_loops_lost']} fewer{before}"
         )
     where, map_file = shlex.quote(str(folder)), folder / "map.ply"
     follows = f"segslam locate {where} SCAN"

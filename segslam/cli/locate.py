@@ -200,6 +200,8 @@ def _read_two(
     both = (source, target)
     if len(words) == 2:
         label_files = [Path(word) for word in words]
+        for file in label_files:
+            check_exists(file, "give two .label files, source and target")
         numbering = files.encoding or encoding_of(label_files)
 
         def of_file(file: Path) -> "LabelsOf":

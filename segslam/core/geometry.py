@@ -134,7 +134,7 @@ def nearest_transform(matrix: np.ndarray) -> Transform:
 def _left_jacobian(phi: np.ndarray) -> Rotation:
     theta = float(np.linalg.norm(phi))
     cross = _cross(phi)
-    if theta < 1e-4:  # series: the closed form loses precision here; the next term is below 1e-17
+    if theta < 1e-4:  # series: the closed form loses precision here; the next terms are below 1e-13
         return np.eye(3) + cross / 2.0 + cross @ cross / 6.0
     a = 2.0 * (math.sin(theta / 2.0) / theta) ** 2  # 1 - cos(theta) as a square, as in `exp`
     b = (theta - math.sin(theta)) / theta**3

@@ -74,6 +74,7 @@ class _Copy:
 
     def _serve(self, pipe: Connection) -> None:
         """Send the results and end; after a failure, nothing is sent."""
+        self._pipe.close()  # else this process, waiting to send, would outlive the other one
         try:
             pipe.send((list(self._do()), peak_of_copy_mb()))
         finally:

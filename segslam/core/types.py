@@ -229,7 +229,8 @@ class Motion(Record):
     information: Information | None = None
     """Information of the motion in the graph; None if the noise model of the odometry holds."""
     covariance: Information | None = None
-    """(6, 6) of the motion since the scan before, tangent in the scan's frame; None if it was not checked."""
+    """(6, 6) of the motion since the scan before, tangent in the scan's frame; None if it was not checked, or is
+    that of other sensors."""
 
     @property
     def is_break(self) -> bool:

@@ -192,8 +192,7 @@ class PoseGraph:
         By the shortest chain of odometry and of the loops that the last estimate kept (`Chains`).
         """
         if self._chains is None:
-            kept = compress(self._closures, [weight >= REJECTED_WEIGHT for weight in self._weights])
-            self._chains = Chains(self.T_world_keyframes, self._kept_odometry(), list(kept))
+            self._chains = Chains(self.T_world_keyframes, self._kept_odometry(), self._kept())
         return self._chains.covariances(keyframe_id, others)
 
     def consistent_pairs(self, closures: Sequence[LoopClosure]) -> Pairs:
@@ -221,9 +220,10 @@ class PoseGraph:
     def weigh_odometry_by(self, closure: LoopClosure) -> None:
         """Increase the noise of odometry until the drift measured by a certain closure is a usual one.
 
-        Drift is usual if its chi-square equals the number of degrees of freedom. Across a break nothing changes.
+        Drift is usual if its chi-square equals the number of degrees of freedom. Nothing changes across a
+        break or a motion that the last estimate rejected.
         """
-        factor = noise_factor(self._odometry, self._edge(closure))
+        factor = noise_factor(self._kept_odometry(), self._edge(closure))
         if factor > 1.0:
             self.multiply_odometry_noise(factor)
 
@@ -328,7 +328,7 @@ class PoseGraph:
 
     def _kept(self) -> list[Edge]:
         """The closures that the last estimate kept."""
-        return list(compress(self._closures, self._weights))
+        return list(compress(self._closures, [weight >= REJECTED_WEIGHT for weight in self._weights]))
 
     def _kept_odometry(self) -> list[Edge]:
         return without(self._odometry, self._rejected)

@@ -340,8 +340,8 @@ class CheckedOdometry:
         return MotionState.REFINED if is_watched or is_off else MotionState.CONFIRMED
 
     def _covariance(self, fit: Fit) -> Information:
-        """Covariance of a registered pose: of its likelihood, and of errors that all points share."""
-        return np.linalg.inv(fit.information) + np.diag(self._shared**2)
+        """Covariance of a registered pose: of its likelihood, `ANYWHERE` at most, and of errors of all points."""
+        return np.linalg.inv(fit.information + np.diag(ANYWHERE**-2.0)) + np.diag(self._shared**2)
 
     def _result(
         self, state: MotionState, T_map_proposed: Transform, fit: Fit, covariance: Information | None

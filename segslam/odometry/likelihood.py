@@ -28,7 +28,7 @@ NORMAL_NOISE = 0.02
 1/3 if normals have no preferred direction. Measured: at most 0.005 in a simulated tunnel without features, at least
 0.063 in real scans."""
 UNOBSERVED = 1e-8
-"""Share of the constraint that is left in an unconstrained direction: 30 m of standard deviation."""
+"""Share of the constraint that is left in an unconstrained direction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +100,7 @@ def _curvature(points: Points, normals: Points, weights: Vector) -> Information:
     """
     along = np.column_stack([np.cross(points, normals), normals])
     hessian = (along * weights[:, None]).T @ along
-    isotropic = _of_points(points, weights) + 1e-9 * np.eye(6)
+    isotropic = _of_points(points, weights) + 1e-9 * (1.0 + weights.sum()) * np.eye(6)  # else singular
     shares, directions = eigh(hessian, isotropic)
     kept = np.maximum(shares - NORMAL_NOISE, UNOBSERVED)
     half = isotropic @ directions

@@ -151,8 +151,8 @@ class MotionModel:
         added, directions = eigh(carried + carried.T, posterior)
         half = posterior @ directions
         total = posterior + (half * np.maximum(added, 0.0)) @ half.T  # errors that cancel may not be counted on
-        self._unseen.append(left @ total @ left.T)
         self.follow(T_fused, gap)
+        self._unseen.append(left @ total @ left.T)
         return T_fused, total + np.outer(regained, regained)
 
     def follow(self, T_last_lidar: Transform, gap: float) -> None:

@@ -65,8 +65,6 @@ def map_folder(
         for step in run.map(scans):
             if not isinstance(step, BadScan):
                 on_step(step)
-        if run.num_steps == 0:
-            raise SegslamError(f"{source.data}: none of its {len(scans)} scans could be used; see the warnings")
         run.complete(place=place)
     return read_run(folder)
 

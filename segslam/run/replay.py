@@ -20,7 +20,7 @@ from segslam.run.run import Run
 from segslam.slam.loop_edits import NO_EDITS, LoopEdits, Pair
 from segslam.slam.slam import Slam
 
-BEFORE_THE_KEYFRAMES = ("sensor", "odometry", "keyframes", "geometric")
+BEFORE_THE_KEYFRAMES = ("sensor", "odometry", "health", "keyframes")
 """Sections of the settings that a replay cannot change, because the log contains their results."""
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -152,11 +153,37 @@ def test_bad_usage_is_named_in_one_line(
 def test_missing_scans_and_lists_are_named(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "other.txt").write_text("3 55\n4 56\n")
     assert run("bench", "pairs", data, "--pairs", tmp_path / "other.txt", *QUICK) == 2
-    assert "scan 4 has no file" in capsys.readouterr().err
+    assert "scan 4 has no file, nor have 1 other" in capsys.readouterr().err
+    rows = [{"source": 3, "target": target, "T_target_source": np.eye(4).tolist()} for target in (55, 56)]
+    (tmp_path / "other.json").write_text(json.dumps(rows))
+    assert run("bench", "pairs", data, "--pairs", tmp_path / "other.json", *QUICK) == 2
+    assert "scan 56 has no file" in capsys.readouterr().err
+    for name, text in (("huge.txt", "3 99999999999999999999"), ("huge.json", json.dumps(rows).replace("55", "1e400"))):
+        (tmp_path / name).write_text(text)
+        assert run("bench", "pairs", data, "--pairs", tmp_path / name, *QUICK) == 2
+        assert name in capsys.readouterr().err
     assert run("bench", "pairs", data, *QUICK) == 2
     assert "--pairs" in capsys.readouterr().err
     assert run("bench", "pairs", data, "--min-m", 3000, "--max-m", 5000, *QUICK) == 2
     assert "--min-m 3000 --max-m 5000: no two scans" in capsys.readouterr().err
+
+
+def test_rows_of_other_data_are_not_taken_for_those_asked(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert bench("pairs", data, "--sample", 1, "--out", out) == 0
+    other = tmp_path / "other"
+    other.symlink_to(data)
+    assert bench("pairs", other, "--sample", 1, "--out", out) == 0, "the same data under another name"
+    other.unlink()
+    shutil.copytree(data, other)
+    capsys.readouterr()
+    assert bench("pairs", other, "--sample", 1, "--out", out) == 2
+    assert "contains a benchmark with other data" in capsys.readouterr().err
+    (out / "asked.json").write_text("[]")
+    assert bench("pairs", data, "--sample", 1, "--out", out) == 2
+    assert "asked.json: is not of a benchmark" in capsys.readouterr().err
 
 
 def test_a_broken_scan_costs_its_pairs_alone(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

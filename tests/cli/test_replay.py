@@ -66,12 +66,13 @@ def test_other_settings_change_the_loops_and_the_change_is_printed(
     assert settings.proximity == SLAM_CONFIG.proximity, "settings of the log that were not changed remain"
 
 
+@pytest.mark.parametrize("change", ["keyframes.voxel_m=0.31", "health.check=false"])
 def test_a_setting_that_acts_before_the_keyframes_is_refused_and_nothing_written(
-    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], change: str
 ) -> None:
     out = tmp_path / "out"
-    assert run("replay", log, "--out", out, "--set", "keyframes.voxel_m=0.31") == 2
-    assert "keyframes.voxel_m: a replay uses the keyframes of" in capsys.readouterr().err
+    assert run("replay", log, "--out", out, "--set", change) == 2
+    assert f"{change.split('=')[0]}: a replay uses the keyframes of" in capsys.readouterr().err
     assert not out.exists()
 
 

@@ -1,8 +1,11 @@
 import os
 import signal
+import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 
 import pytest
 
@@ -139,3 +142,32 @@ def test_a_copy_is_not_ended_by_ctrl_c() -> None:
         return [os.getpid()]
 
     assert len(set(in_parts(range(3), interrupted))) == 3
+
+
+ENDS_BEFORE_ITS_COPY = """
+import os, threading, time
+import numpy as np
+from segslam.core import processes
+os.sched_getaffinity = lambda _: {0, 1}
+def work(part):
+    for number in part:
+        if number:
+            print(os.getpid(), flush=True)
+            yield np.zeros(200_000)
+        else:
+            time.sleep(1.0)
+            os._exit(130)
+list(processes.in_parts([0, 1], work))
+"""
+
+
+def test_a_copy_ends_with_a_process_that_was_killed_though_nobody_reads_its_results() -> None:
+    ended = subprocess.run([sys.executable, "-c", ENDS_BEFORE_ITS_COPY], stdout=subprocess.PIPE, text=True)
+    assert ended.returncode == 130
+    copy = Path("/proc") / ended.stdout.strip()
+    for _ in range(100):
+        if not copy.exists():
+            return
+        time.sleep(0.05)
+    os.kill(int(copy.name), signal.SIGKILL)
+    pytest.fail("the copy waits for ever")

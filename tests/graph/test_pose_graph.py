@@ -536,3 +536,21 @@ def test_placements_in_a_map_have_the_weights_of_their_keyframes() -> None:
     assert len(graph.motion_variance) == graph.num_keyframes
     assert min(graph.weights.values()) > 0.9
     np.testing.assert_allclose(estimate.T_world_keyframe[0][:3, 3], [5.0, 0.0, 0.0], atol=1e-3)
+
+
+def test_a_rejected_jump_of_the_odometry_is_no_drift() -> None:
+    """A loop across it, confirmed after the final optimisation, does not make the odometry less certain."""
+    truth = circle(240)
+    jump = geometry.transform(np.eye(3), [60.0, 0.0, 0.0])
+    odometry = truth.copy()
+    odometry[130:] = odometry[129] @ jump @ geometry.inverse(truth[129]) @ truth[130:]
+    graph = PoseGraph(CONFIG)
+    for number, (T_odom, way_m) in enumerate(zip(odometry, travel_m(truth), strict=True)):
+        graph.add_keyframe(number, T_odom, way_m)
+    for source in range(140, 236, 4):
+        graph.add_closure(true_closure(truth, source, source - 120))
+    assert list(graph.finish().motion_weights) == [(129, 130)]
+    graph.weigh_odometry_by(true_closure(truth, 237, 117))
+    graph.add_closure(true_closure(truth, 237, 117))
+    assert list(graph.finish().motion_weights) == [(129, 130)]
+    assert np.linalg.norm((graph.T_world_keyframes - truth)[:, :3, 3], axis=1).max() < 1.0

@@ -368,6 +368,49 @@ def test_the_covariance_of_a_motion_is_at_least_its_own_whatever_the_errors_befo
         assert np.linalg.eigvalsh(covariance - own).min() > -1e-9 * np.linalg.eigvalsh(covariance).max()
 
 
+def test_what_scans_did_not_show_is_turned_with_the_sensor_once() -> None:
+    """A quarter turn, after which the direction ahead is unseen."""
+    model = MotionModel()
+    for sign in (1.0, -1.0) * 4:
+        model.update(geometry.transform(geometry.yaw(0.3), [1.0, 0.01 * sign, 0.0]), 1e-6 * np.eye(6), 1.0)
+    measured = np.diag(geometry.tangent(rotation_rad=1e-6, translation_m=[900.0, 1e-6, 1e-6]))
+    _, covariance = model.update(geometry.transform(geometry.yaw(np.pi / 2), [1.0, 0.0, 0.0]), measured, 1.0)
+    assert covariance[3, 3] > 100.0 * covariance[4, 4]
+    assert model._unseen[-1][3, 3] > 100.0 * model._unseen[-1][4, 4]
+
+
+@pytest.mark.parametrize("num_shared", [0, 1, 2, 5])
+def test_a_scan_that_shares_a_few_points_with_the_map_is_a_break(num_shared: int) -> None:
+    rng = np.random.default_rng(num_shared)
+    street = rng.uniform(-25.0, 25.0, (2500, 3))
+    street[:800, 2] = -1.7
+    street[800:1600, 1] = np.where(rng.random(800) < 0.5, 8.0, -8.0)
+    azimuth, range_m = rng.uniform(0.0, 2.0 * np.pi, 400), rng.uniform(40.0, 58.0, 400)
+    far = np.column_stack([range_m * np.cos(azimuth), range_m * np.sin(azimuth), rng.uniform(5.0, 25.0, 400)])
+    slam = Slam(Config())
+    slam.process(Scan(street.astype(np.float32), 0))
+    motion = slam.process(Scan(np.vstack([far, street[:num_shared]]).astype(np.float32), 100_000_000)).motion
+    assert motion is not None
+    assert motion.state is MotionState.BROKEN
+
+
+@pytest.mark.parametrize("voxel_m", [0.5, 0.1])
+def test_a_pose_at_which_one_point_meets_the_map_has_an_information(voxel_m: float) -> None:
+    rng = np.random.default_rng(0)
+    config = CONFIG.refine.model_copy(update={"voxel_m": voxel_m})
+    level = rng.uniform(-55.0, 55.0, (3000, 2))
+    scan = SeenScan(np.column_stack([level, np.full(3000, -1.7)]).astype(np.float32), config)
+    local = LocalMap(config)
+    local.add(np.eye(4), scan)
+    points = scan.surface.points
+    far = points[np.linalg.norm(points, axis=1) > 40.0]
+    for _ in range(40):
+        here, there = far[rng.integers(len(far), size=2)]
+        R = geometry.exp(geometry.tangent(rotation_rad=0.5 * rng.standard_normal(3), translation_m=0.0))[:3, :3]
+        information = local.fit(scan, geometry.transform(R, there - R @ here)).information
+        assert np.linalg.eigvalsh(information).max() > 0.0
+
+
 @pytest.mark.data
 @pytest.mark.parametrize("row", [29, 53, 54])
 def test_a_narrow_view_of_new_surroundings_does_not_slide_back_along_a_wall(data_dir: Path, row: int) -> None:

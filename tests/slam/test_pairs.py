@@ -86,3 +86,11 @@ def test_no_submap_is_paired_with_itself_or_a_later_one() -> None:
     pairs = pairs_between_passes(T_world, travel_m, min_travel_m=0.0)
     assert len(pairs)
     assert (pairs[:, 0] < pairs[:, 1]).all()
+
+
+def test_a_pair_along_the_drive_that_is_one_of_two_passes_is_there_once() -> None:
+    angles = np.arange(200) / 6.0
+    circle = poses(6.0 * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(200)]))
+    pairs = all_pairs(circle, np.arange(200.0), known, min_travel_m=6.0)
+    assert len(pairs_between_passes(circle, np.arange(200.0), min_travel_m=6.0))
+    assert len(np.unique(pairs, axis=0)) == len(pairs)

@@ -154,3 +154,12 @@ def test_an_adjustment_is_dropped_to_the_last_final_optimisation() -> None:
     made.adjust(measured)
     made.drop_adjustment()
     np.testing.assert_array_equal(made.T_world_keyframes, last)
+
+
+@pytest.mark.long
+def test_pairs_along_a_drive_are_of_one_pass_however_long_they_are() -> None:
+    made = graph()
+    config = CONFIG.model_copy(update={"proximity": CONFIG.proximity.model_copy(update={"min_travel_m": STEP_M})})
+    found = adjust(made, made.finish(), points, STILL, config=config)
+    assert found is not None
+    assert found.record.num_between_passes == 0

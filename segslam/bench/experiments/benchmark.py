@@ -109,12 +109,14 @@ def _rows_before(folder: Path, job: Job, trials: Sequence[Trial]) -> list[Row]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
+        if not isinstance(before, dict | None):
+            raise ValueError("not an object")
         if before is None:
             write_whole(file, json.dumps(identity, indent=1) + "\n")
     except OSError as error:
         raise SegslamError(f"{file}: cannot be read or written ({reason(error)}); choose another --out") from error
     except ValueError as error:
-        raise SegslamError(f"{file}: is not JSON ({error}); choose another --out") from error
+        raise SegslamError(f"{file}: is not of a benchmark ({error}); choose another --out") from error
     if before is None:
         return []
     for key in identity:
@@ -133,6 +135,7 @@ def _identity(job: Job, trials: Sequence[Trial]) -> dict[str, Any]:
     return {
         "methods": list(job.methods),
         "settings": job.config.model_dump(mode="json"),
+        "data": [str(job.source.data.resolve()), job.source.sequence, job.source.dataset],
         "labels": [job.source.labels, job.source.encoding],
         "pairs": {"number": len(trials), "sha256": digest.hexdigest()},
     }

@@ -102,7 +102,7 @@ def _from_text(file: Path, text: str) -> PairList:
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
-        if len(words) < 2 or not all(word.isdecimal() for word in words[:2]):
+        if len(words) < 2 or not all(word.isdecimal() and len(word) < 19 for word in words[:2]):
             raise SegslamError(f"{file}:{number}: expected two scan numbers, source and target, found {line.strip()!r}")
         pairs.append((int(words[0]), int(words[1])))
     return PairList(file.stem, np.array(pairs, dtype=int).reshape(-1, 2), len(pairs))
@@ -116,7 +116,7 @@ def _from_json(file: Path, text: str) -> PairList:
             )
             for row in json.loads(text)
         }
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise SegslamError(
             f"{file}: expected a list of objects with source, target and T_target_source (4x4): {error}"
         ) from error

@@ -152,8 +152,8 @@ def adjust(
     correction_deg = 0.0 if last.angle is None else last.angle.correction_deg
     of_map = corrected_by(corrections_of(correction_deg, sweep, velocities), points_of)
     ends = np.array([(edge.a, edge.b) for edge in last.registered])
-    is_between = np.abs(np.diff(travel_m[ends], axis=1)[:, 0]) >= config.proximity.min_travel_m
     apart = np.diff(ends, axis=1)[:, 0]
+    is_between = apart > STEPS[-1]
     seen_twice = ends[is_between if is_between.any() else apart == apart.max()]  # else seen from farthest apart
     before_m, after_m = (map_thickness_m(of_map, T, seen_twice) for T in (T_before, graph.T_world_keyframes))
     is_corrected = sweep is not None or correction_deg != 0.0

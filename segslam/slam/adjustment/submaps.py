@@ -80,7 +80,7 @@ def all_pairs(T_world: Poses, travel_m: Vector, covariances: Covariances, *, min
     """
     passes = pairs_between_passes(T_world, travel_m, min_travel_m=min_travel_m)
     pairs = np.vstack([pairs_along(len(travel_m)), passes])
-    pairs = pairs[np.lexsort((pairs[:, 0], pairs[:, 1]))]
+    pairs = np.unique(pairs[:, ::-1], axis=0)[:, ::-1]
     between = (covariances(source, np.array([target]))[0] for target, source in pairs.tolist())
     is_sure = [geometry.chance_beyond(SEARCH_M[0], covariance) < SIGNIFICANT for covariance in between]
     return pairs[np.array(is_sure, dtype=bool)]

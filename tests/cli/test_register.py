@@ -73,7 +73,7 @@ def test_labels_are_taken_in_one_option_or_in_two(files: dict[str, Path], capsys
         (["{source}", "{target}", "--method", "magic"], "magic"),
         (["{source}", "{target}", "--labels", "{source_labels}"], "two .label files"),
         (["{source}", "{target}", "--labels", "{target_labels}", "{source_labels}"], "labels for"),
-        (["{source}", "{target}", "--labels", "{source_labels}", "typo.label"], "typo.label: no such file"),
+        (["{source}", "{target}", "--labels", "a.label", "b.label"], "a.label: no such file"),
         (["{source}", "{target}", "--dataset", "kitty"], "kitty"),
         (["{source_labels}", "{target}"], ".label"),
     ],

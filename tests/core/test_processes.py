@@ -162,9 +162,10 @@ list(processes.in_parts([0, 1], work))
 
 
 def test_a_copy_ends_with_a_process_that_was_killed_though_nobody_reads_its_results() -> None:
-    ended = subprocess.run([sys.executable, "-c", ENDS_BEFORE_ITS_COPY], stdout=subprocess.PIPE, text=True)
-    assert ended.returncode == 130
-    copy = Path("/proc") / ended.stdout.strip()
+    with subprocess.Popen([sys.executable, "-c", ENDS_BEFORE_ITS_COPY], stdout=subprocess.PIPE, text=True) as ended:
+        assert ended.stdout is not None
+        copy = Path("/proc") / ended.stdout.readline().strip()
+        assert ended.wait() == 130
     for _ in range(100):
         if not copy.exists():
             return

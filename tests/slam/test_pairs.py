@@ -89,8 +89,9 @@ def test_no_submap_is_paired_with_itself_or_a_later_one() -> None:
 
 
 def test_a_pair_along_the_drive_that_is_one_of_two_passes_is_there_once() -> None:
-    angles = np.arange(200) / 6.0
-    circle = poses(6.0 * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(200)]))
-    pairs = all_pairs(circle, np.arange(200.0), known, min_travel_m=6.0)
-    assert len(pairs_between_passes(circle, np.arange(200.0), min_travel_m=6.0))
+    travel_m = 0.5 * np.arange(200)
+    circle = poses(6.0 * np.column_stack([np.cos(travel_m / 6.0), np.sin(travel_m / 6.0), np.zeros(200)]))
+    pairs = all_pairs(circle, travel_m, known, min_travel_m=3.0)
+    assert [186, 192] in pairs_between_passes(circle, travel_m, min_travel_m=3.0).tolist()
+    assert [186, 192] in pairs_along(200).tolist()
     assert len(np.unique(pairs, axis=0)) == len(pairs)

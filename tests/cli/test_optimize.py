@@ -112,17 +112,17 @@ def test_a_group_of_false_edges_that_are_consistent_with_each_other_is_rejected(
     assert found.outliers == tuple((edge.a, edge.b) for edge in false)
 
 
-def test_pairs_of_closures_are_compared_up_to_a_number_and_more_are_told_by_graduated_non_convexity(
+def test_of_more_closures_than_are_compared_pairwise_graduated_non_convexity_selects(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
     graph, truth = square(num_false=4)
-    for most, told in ((12, False), (11, True)):
+    for most, is_graduated in ((12, False), (11, True)):
         caplog.clear()
         monkeypatch.setattr(batch_search, "MAX_PAIRED", most)
         found = optimize_graph(graph)
         np.testing.assert_allclose(poses(found.graph), truth, atol=1e-4)
-        assert ("graduated non-convexity" in caplog.text) is told
+        assert ("graduated non-convexity" in caplog.text) is is_graduated
 
 
 def test_odometry_may_be_written_backwards_twice_and_from_any_id() -> None:

@@ -161,7 +161,7 @@ list(processes.in_parts([0, 1], work))
 """
 
 
-def test_a_copy_ends_with_a_process_that_was_killed_though_nobody_reads_its_results() -> None:
+def test_a_copy_ends_with_its_process_though_its_results_were_not_received() -> None:
     with subprocess.Popen([sys.executable, "-c", ENDS_BEFORE_ITS_COPY], stdout=subprocess.PIPE, text=True) as ended:
         assert ended.stdout is not None
         copy = Path("/proc") / ended.stdout.readline().strip()

@@ -108,7 +108,7 @@ def _standing(points: Points, labels: Labels, *, reach_m: float) -> Points:
 def signature_of_standing(points: Points) -> PlaceSignature:
     """The signature of points that stand above the ground, in a level frame with the sensor at the origin."""
     magnitudes = np.abs(rfft2(_image(points), (SIZE, SIZE)))
-    roots = np.sqrt(map_coordinates(np.pad(magnitudes, ((0, 0), (0, 1))), SAMPLES, order=1, mode="grid-wrap"))
+    roots = np.sqrt(map_coordinates(magnitudes, SAMPLES, order=1, mode="grid-wrap"))
     return PlaceSignature(np.rint(255.0 * roots / max(float(roots.max()), 1e-9)).astype(np.uint8))
 
 

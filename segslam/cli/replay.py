@@ -1,7 +1,7 @@
 """`segslam replay`, `edit` and `refine`: a new run from the log of another."""
 
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Generator
+from contextlib import ExitStack, closing
 from itertools import chain, tee
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -132,7 +132,8 @@ def _replay_log(
         outcomes = {attempt.candidate.pair: outcome_text(attempt, weights) for attempt in result.attempts}
         for pair in sorted(edits.added):
             terminal.say(f"added {pair[0]}:{pair[1]}: {outcomes.get(pair, 'not tried, because the run ended before')}")
-        return _compared(recorded, before, now)
+        left = {"num_scans_left": recorded.num_steps() - run.num_steps} if stopped else {}
+        return _compared(recorded, before, now) | left
 
     replayed = Replay.of(log, config=changes.config, settings=changes.overrides(), edits=edits)
     recorded = replayed.recorded
@@ -148,8 +149,8 @@ def _replay_log(
         when_stopped(f"the log in {folder} is kept, without results")
         run = stack.enter_context(replayed.begun(folder, slam, mirror=server.send if server else None))
         copy_alone(recorded.path.parent, folder)
-        steps = _repeated(recorded, run, before, now)
-        stopped = is_interrupted(terminal.progress(steps, recorded.num_steps(), "replay"))
+        with closing(_repeated(recorded, run, before, now)) as steps:  # ends the thread that works
+            stopped = is_interrupted(terminal.progress(steps, recorded.num_steps(), "replay"))
         if stopped and run.num_steps == 0:
             when_stopped("nothing was written")
             raise typer.Exit(EXIT_STATUS)
@@ -159,7 +160,7 @@ def _replay_log(
         raise typer.Exit(EXIT_STATUS)
 
 
-def _repeated(recorded: "RunLog", run: "Run", before: set[Pair], after: set[Pair]) -> "Iterator[Step]":
+def _repeated(recorded: "RunLog", run: "Run", before: set[Pair], after: set[Pair]) -> "Generator[Step, None, None]":
     """Repeats the steps of a log; adds the pairs of their loops to `before`, those of the new loops to `after`."""
     originals, sources = tee(recorded.steps())  # read alternately: only one step is in memory
     for original, repeated in zip(originals, run.repeat(sources), strict=True):

@@ -27,7 +27,7 @@ class Confirmation:
 
     def is_waiting(self, keyframe_id: int) -> bool:
         """True if this keyframe may confirm an earlier registration."""
-        return any(self._is_near(keyframe_id, one) for _, one in self._waiting)
+        return bool(self._near(keyframe_id))
 
     def attempts(
         self, candidate: LoopCandidate, closure: LoopClosure, seconds: dict[str, float]
@@ -36,7 +36,7 @@ class Confirmation:
 
         If they confirm each other, the noise of an odometry that contradicts them is increased.
         """
-        waiting = [one for one in self._waiting if self._is_near(closure.source_id, one[1])]
+        waiting = self._near(closure.source_id)
         closures = [closure, *(other for _, other in waiting)]
         consistent = list(compress(waiting, self._graph.consistent_pairs(closures)[0, 1:])) if waiting else []
         sources = {other.source_id for _, other in consistent} - {closure.source_id}
@@ -48,10 +48,10 @@ class Confirmation:
             self._waiting.append((candidate, closure))
             shown = f"{len(sources)} of {MIN_CONSISTENT - 1} earlier keyframes confirm it"
             return (LoopAttempt(candidate, Rejected(RejectReason.UNCONFIRMED, shown), seconds),)
-        self._waiting = [one for one in self._waiting if not self._is_near(closure.source_id, one[1])]
+        self._waiting = [one for one in self._waiting if not any(one is near for near in waiting)]
         self._graph.weigh_odometry_by(closure)
         return *(LoopAttempt(*one, {}) for one in consistent), LoopAttempt(candidate, closure, seconds)
 
-    def _is_near(self, keyframe_id: int, waiting: LoopClosure) -> bool:
+    def _near(self, keyframe_id: int) -> list[tuple[LoopCandidate, LoopClosure]]:
         travel_m = self._graph.travel_m
-        return bool(abs(travel_m[keyframe_id] - travel_m[waiting.source_id]) <= WAITING_M)
+        return [one for one in self._waiting if abs(travel_m[keyframe_id] - travel_m[one[1].source_id]) <= WAITING_M]

@@ -56,7 +56,7 @@ SAME_START_M, SAME_START_RAD = 0.5, math.radians(2.0)
 SPARSE_VOXELS, LEAST_SPARSE = 3.0, 500
 """Chosen: edge of the voxels of a sparse surface, in `voxel_m`, and the points that it has at least."""
 NUM_APPROACH = 5
-"""Chosen: iterations after which a pose that leads to no good fit can be recognised (`registration.HOPELESS`)."""
+"""Chosen: iterations after which a pose that leads to no good fit can be recognised."""
 UNOBSERVED = 0.01
 """Chosen: a ratio of variances below this means unobserved; a smooth tunnel has 0.001, from GICP's tangents."""
 

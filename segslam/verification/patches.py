@@ -59,7 +59,7 @@ class Agreement(NamedTuple):
     """What two scans show at a pose; of overlap, residual and violation the worse of both directions of comparison."""
 
     overlap: float
-    """Share of the standing points within reach of the other scan that lie within `inlier_m` of it."""
+    """Share of the standing points within reach of the other scan that lie within `INLIER_M` of it."""
     rms_m: float
     """Root mean square distance of these points to the planes of the other surface (m); infinite if there are none."""
     free_space_violation: float

@@ -87,12 +87,12 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def interrupt_after(num_scans: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C is pressed when the bar of `map` has come so far."""
+def interrupt_after(num_scans: int, monkeypatch: pytest.MonkeyPatch, *, command: str = "map") -> None:
+    """Ctrl-C is pressed when the bar of the command has come so far."""
 
     def interrupted(_: Terminal, items: Iterable[Any], total: int, title: str) -> Iterator[Any]:
         for number, item in enumerate(items):
-            if title == "map" and number == num_scans:
+            if title == command and number == num_scans:
                 signal.raise_signal(signal.SIGINT)
             yield item
 
@@ -118,6 +118,19 @@ def test_an_interrupted_run_continues_with_the_printed_command(
     metrics = json.loads(capsys.readouterr().out)
     assert metrics["num_scans"] == 5
     assert "num_scans_left" not in metrics
+
+
+def test_an_interrupted_replay_tells_how_many_scans_are_left(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("map", data, "--out", tmp_path / "run", "--quiet") == 0
+    interrupt_after(2, monkeypatch, command="replay")
+    assert run("replay", tmp_path / "run", "--out", tmp_path / "again", "--quiet") == 130
+    capsys.readouterr()
+    assert run("info", tmp_path / "again", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["state"] == "interrupted"
+    assert found["num_steps"] + found["figures"]["num_scans_left"] == 5
 
 
 def test_before_the_first_scan_nothing_is_left(

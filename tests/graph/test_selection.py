@@ -85,7 +85,7 @@ def test_a_group_of_two_changes_nothing() -> None:
 def test_the_inliers_that_are_consistent_with_a_rejected_group_stay_while_it_is_tried(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One that lies between the two groups is consistent with both."""
+    """A closure that is shifted by half as much as the false ones is consistent with both groups."""
     problem, truth, agree, near = problem_of([*TRUE, *FALSE, closure(155, 6.0)])
     misled = settle_from(problem, truth, largest_consistent(agree))
     inliers = misled.weights > 0.0

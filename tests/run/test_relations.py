@@ -61,6 +61,11 @@ def test_the_inverse_has_the_same_cost_for_the_same_motion() -> None:
     )
 
 
+def test_drives_that_look_like_nothing_are_a_pair_like_others() -> None:
+    components = Components(3)
+    assert components.next_pairs({(1, 0): 0.0, (2, 0): 0.0, (2, 1): 0.0}) == [(1, 0), (2, 0)]
+
+
 def test_each_drive_is_related_to_the_most_similar_earlier_one_first() -> None:
     components = Components(5)
     similarity = {(2, 0): 9.0, (2, 1): 7.0, (3, 1): 3.0, (4, 3): 5.0}

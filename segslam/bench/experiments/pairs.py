@@ -89,8 +89,8 @@ def true_poses(pairs: PairList, reference: Trajectory | None) -> dict[tuple[int,
     if len(rows) < len(numbers):
         missing = np.setdiff1d(numbers, numbers[rows[:, 0]])
         raise SegslamError(
-            f"{pairs.name}: scan {missing[0]} has no file or no true pose, nor have {len(missing) - 1} other scans; "
-            "put them there, or --sample pairs of a list whose scans are all there"
+            f"{pairs.name}: scan {missing[0]} has no true pose, nor have {len(missing) - 1} other scans; put them "
+            "there, or give a list whose scans all have one"
         )
     T_world = dict(zip(numbers[rows[:, 0]].tolist(), reference.T_world_lidar[rows[:, 1]], strict=True))
     return {(source, target): geometry.inverse(T_world[target]) @ T_world[source] for source, target in keys}

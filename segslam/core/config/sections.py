@@ -82,7 +82,7 @@ class OdometryConfig(Section):
     deskew: bool = True
     """compensate the motion within a sweep, if the points have times [KISS-ICP]"""
     max_num_threads: int = Field(0, ge=0)
-    """threads of KISS-ICP; 0: all cores, in any order: runs differ by rounding; 1: poses repeat exactly [KISS-ICP]"""
+    """threads of KISS-ICP; 0: all cores, in any order: poses are rounded, so that they repeat [KISS-ICP]"""
 
     @model_validator(mode="after")
     def _has_a_range(self) -> "OdometryConfig":

@@ -24,7 +24,7 @@ from segslam.registration.segregator.pose_solver import Scored, solve_level, sol
 CLIQUE_MAX_NODES = 200_000
 """Chosen: search nodes after which the search stops with the best clique found."""
 CERTAIN_INLIERS = 12
-"""Chosen on simulated 00 and 08: number of inliers above which a pose is certain and no other is tried."""
+"""Chosen on simulated 00 and 08: least number of inliers of a certain pose, after which no other is tried."""
 
 MIN_GROUND_PATCHES = 5
 """Chosen: smallest number of ground patches that determine the vertical."""
@@ -46,7 +46,7 @@ def match(source: Description, target: Description, *, config: SegregatorConfig)
 
 
 def hypotheses(source: Description, target: Description, *, config: SegregatorConfig) -> list[Registration] | Rejected:
-    """Distinct poses, the one with the highest score first; only one if it is certain.
+    """Distinct poses, the one with the highest score first; none is searched after a certain one.
 
     `Rejected` as `match` returns it, for the narrowest bound.
     """

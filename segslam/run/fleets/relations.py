@@ -1,5 +1,6 @@
 """Relative poses of drives: inverted, and chained to the poses of a component."""
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from heapq import heappop, heappush
@@ -80,5 +81,5 @@ class Components:
         for pair, value in similarity.items():
             own, other = (self._component[drive] for drive in pair)
             if own != other and pair not in self._tried and self._num_failed[own] < MOST_FAILED:
-                best[own] = max(best.get(own, (0.0, (0, 0))), (value, (-pair[0], -pair[1])))
+                best[own] = max(best.get(own, (-math.inf, (0, 0))), (value, (-pair[0], -pair[1])))
         return sorted((-negated[0], -negated[1]) for _, negated in best.values())

@@ -131,6 +131,8 @@ def test_an_interrupted_replay_tells_how_many_scans_are_left(
     found = json.loads(capsys.readouterr().out)
     assert found["state"] == "interrupted"
     assert found["num_steps"] + found["figures"]["num_scans_left"] == 5
+    assert run("info", tmp_path / "again") == 0
+    assert "segslam resume" not in capsys.readouterr().out, "it refuses a replay"
 
 
 def test_before_the_first_scan_nothing_is_left(

@@ -110,8 +110,8 @@ def _lines(found: dict[str, Any]) -> str:
 
     num_steps = counted(found["num_steps"], "scan")
     is_replay = "num_scans_left" in found["figures"] and "data" not in found["options"]
-    goes_on = found["state"] == "interrupted" and not is_replay
-    then = f"; continue with: segslam resume {shlex.quote(found['run'])}" if goes_on else ""
+    is_resumable = found["state"] == "interrupted" and not is_replay
+    then = f"; continue with: segslam resume {shlex.quote(found['run'])}" if is_resumable else ""
     text = [f"{found['run']}: {found['data']}, {found['state']}, {num_steps} in the log{then}"]
     text += with_meanings([found["figures"]], {key: FIGURES[key] for key in found["figures"]}).splitlines()
     for title, values in (("options", found["options"]), ("settings changed", found["changed_settings"])):

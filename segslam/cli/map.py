@@ -287,7 +287,8 @@ def _map_scans(
             shown = terminal.progress(steps, total, title)
             return is_interrupted(map(scene.add, shown) if scene else shown)
 
-        apart = OdometryApart(settings.odometry, keeps_alone=True) if odometry is None else nullcontext(odometry)
+        compares = scans.reference is not None  # KISS-ICP alone is for errors, and may take half of the time
+        apart = OdometryApart(settings.odometry, keeps_alone=compares) if odometry is None else nullcontext(odometry)
         with apart as used:
             run = stack.enter_context(
                 begun(

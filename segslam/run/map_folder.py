@@ -60,8 +60,8 @@ def map_folder(
     own = {"odometry": odometry, "slam_of": maker, "place": place}
     not_resumed = [name for name, value in own.items() if value is not None]
     recorded = {**resume_options(source), "python": ", ".join(not_resumed), **options}
-    alone = KissOdometry(config.odometry, keeps_alone=True)
-    with begun(scans, folder, config, odometry=odometry or alone, slam_of=slam_of, options=recorded) as run:
+    kiss = KissOdometry(config.odometry, keeps_alone=scans.reference is not None)
+    with begun(scans, folder, config, odometry=odometry or kiss, slam_of=slam_of, options=recorded) as run:
         for step in run.map(scans):
             if not isinstance(step, BadScan):
                 on_step(step)

@@ -1,5 +1,7 @@
 import json
 import multiprocessing
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 from helpers.commands import run
 from helpers.drives import round_drive, write_kitti_sequence
 
+from segslam import map_folder
 from segslam.core.config import OdometryConfig
 from segslam.core.errors import SegslamError
 from segslam.core.trajectory import read_poses, travelled_m, write_kitti
@@ -72,6 +75,17 @@ def test_the_end_of_map_leads_on(kitti: Path, tmp_path: Path, capsys: pytest.Cap
     assert len(read_poses(out / "kiss_icp_tum.txt")) == metrics["num_scans"]
     assert run("replay", out, "--out", tmp_path / "again", "--json", "--quiet") == 0
     assert json.loads(capsys.readouterr().out)["kiss_icp_ate_m"] == pytest.approx(metrics["kiss_icp_ate_m"])
+
+
+@pytest.mark.parametrize("mapped", [lambda data, out: run("map", data, "--out", out), map_folder])
+def test_kiss_icp_alone_is_computed_only_to_be_compared_with_the_truth(
+    mapped: Callable[[Path, Path], object], tmp_path: Path
+) -> None:
+    write_kitti_sequence(tmp_path / "kitti", num_scans=5)
+    shutil.rmtree(tmp_path / "kitti" / "poses")
+    mapped(tmp_path / "kitti", tmp_path / "run")
+    assert len(read_poses(tmp_path / "run" / "odometry_tum.txt")) == 5
+    assert not list((tmp_path / "run").glob("kiss_icp_*"))
 
 
 def test_a_run_folder_is_never_overwritten(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,7 @@ RADIUS_M = 5.0
 def _short_drives(monkeypatch: pytest.MonkeyPatch) -> None:
     """Distances that suit the drives of these tests."""
     monkeypatch.setattr(submaps, "STEPS", (3, 6))
-    monkeypatch.setattr(submaps, "RADIUS_M", RADIUS_M)
+    monkeypatch.setattr(submaps, "OTHER_PLACE_M", RADIUS_M)
 
 
 def poses(places: np.ndarray) -> np.ndarray:

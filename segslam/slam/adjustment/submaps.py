@@ -9,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial import cKDTree
 
+from segslam.candidates.places import OTHER_PLACE_M
 from segslam.candidates.proximity import Covariances
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
@@ -28,8 +29,6 @@ EVERY = 2
 """Chosen on KITTI 00: a submap is registered for every n-th keyframe."""
 STEPS = (5, 10)
 """Chosen on KITTI 00: distances of registered submaps along the drive, in keyframes."""
-RADIUS_M = 10.0
-"""Chosen on KITTI 00: largest distance of registered submaps of two passes (m)."""
 STOREY_M = 2.0
 """Chosen: keyframes of two passes with a larger difference of heights may be on two storeys."""
 
@@ -96,11 +95,11 @@ def pairs_along(num_keyframes: int) -> IndexPairs:
 def pairs_between_passes(T_world: Poses, travel_m: Vector, *, min_travel_m: float) -> IndexPairs:
     """(k, 2) target (older) and source of pairs of two passes of one place, at least `min_travel_m` of travel apart.
 
-    Each node is paired with the nearest node of each earlier pass within the radius.
+    Each node is paired with the nearest node of each earlier pass that shows the same place (`OTHER_PLACE_M`).
     """
     nodes = _nodes(len(travel_m))
     places = T_world[nodes, :3, 3]
-    near = cKDTree(places[:, :2]).query_ball_point(places[:, :2], RADIUS_M)
+    near = cKDTree(places[:, :2]).query_ball_point(places[:, :2], OTHER_PLACE_M)
     pairs = []
     for row, rows in enumerate(near):
         older = np.array(sorted(other for other in rows if other < row), dtype=np.int64)

@@ -28,8 +28,9 @@ ROUNDS = 12
 PRIOR_TILT_DEG, PRIOR_OFFSET_S, PRIOR_ARM_M = 2.0, 1.0, 1.0
 """Chosen: standard deviations, before the fixes, of the tilt of the map, the offset of the clocks, and each component
 of the lever arm."""
-PRIOR = np.array([*2 * [np.radians(PRIOR_TILT_DEG)], 0.1, 10.0, 10.0, 10.0, PRIOR_OFFSET_S, PRIOR_ARM_M, PRIOR_ARM_M])
-"""The same of all constants of `linearised`; of heading and position, more than the start is off by."""
+PRIOR = np.array([*2 * [np.radians(PRIOR_TILT_DEG)], 1.0, 1e4, 1e4, 1e4, PRIOR_OFFSET_S, PRIOR_ARM_M, PRIOR_ARM_M])
+"""The same of all constants of `linearised`; those of heading and position are so large that the fixes alone determine
+both, also if all fixes are kilometres from the first keyframe."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

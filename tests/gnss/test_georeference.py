@@ -120,6 +120,21 @@ def test_fixes_that_cannot_place_a_drive_are_refused_with_the_reason() -> None:
         georeference(edges, drive, equal)
 
 
+@pytest.mark.parametrize(("step_m", "first", "sigma_m"), [(0.2, 0, 26.0), (2.0, NUM - 15, 5.0)])
+def test_a_heading_that_the_fixes_alone_do_not_determine_is_refused(step_m: float, first: int, sigma_m: float) -> None:
+    """The errors of the fixes allow 5 degrees and more, and the fixes may be far from the first keyframe."""
+    poses = np.stack([geometry.transform(np.eye(3), [step_m * row, 0.0, 0.0]) for row in range(NUM)])
+    spread_m = step_m * np.std(np.arange(first, NUM))
+    heading_deg = np.degrees(sigma_m / (np.sqrt(NUM - first) * spread_m))
+    assert heading_deg > 5.0
+    fixes = _fixes(poses, sigma_m=sigma_m)
+    rows = [Row(int(fixes.stamp_ns[row]), *fixes.places[row]) for row in range(first, NUM)]
+    with pytest.raises(SegslamError, match="the fixes determine the heading of the map to") as raised:
+        place(prepare(make_fixes("fixes", rows), _drive(poses)))
+    found_deg = float(str(raised.value).split(" degrees only")[0].rpartition(" ")[2])
+    assert found_deg == pytest.approx(heading_deg, rel=0.4)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     "longitude", [179.9999, *(pytest.param(one, marks=pytest.mark.slow) for one in (11.9999, -180.0))]

@@ -88,3 +88,16 @@ def test_a_network_is_relative_to_the_list_and_labels_elsewhere_change_the_key(t
     (tmp_path / "m.onnx").write_bytes(b"12")
     (tmp_path / "labels" / "0.label").write_bytes(b"1")
     assert all(one != drive.key("1") for one, drive in zip(before, drives, strict=True))
+
+
+def test_the_settings_of_a_network_change_the_key(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    model = tmp_path / "m.onnx"
+    model.write_bytes(b"1")
+    (drive,) = read_drives(_written(tmp_path, f"- {{data: a, labels: 'network:{model}'}}"))
+    shared = "field_of_view_deg: [-20, 20]\nheight: 4\nwidth: 8\nchannels: [range]\nmean: [10]\nstd: [5]\n"
+    keys = []
+    for classes in ("car, road", "road, car", "road, car"):
+        model.with_suffix(".yaml").write_text(f"{shared}classes: [{classes}]\n")
+        keys.append(drive.key("1"))
+    assert keys[0] != keys[1] == keys[2]

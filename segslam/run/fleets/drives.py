@@ -15,6 +15,7 @@ from segslam.core.errors import unreadable
 from segslam.core.types import SegslamError
 from segslam.core.whole_files import expanded, read_text
 from segslam.labels.label_files import NETWORK, whole_source
+from segslam.labels.network_settings import read_settings, settings_file
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +40,16 @@ class Drive:
     def key(self, version: str) -> str:
         """A hash of the recording, of the options, and of the version: equal keys stand for equal runs.
 
-        Of a recording the names, sizes and times of its files are used. Raises SegslamError if it is missing.
+        Of a recording the names, sizes and times of its files are used, of a network also its settings. Raises
+        SegslamError if the recording is missing, or if the settings of the network are invalid.
         """
         options = {name: value for name, value in asdict(self).items() if name not in ("name", "data")}
         gnss = self.gnss if self.gnss and Path(self.gnss).exists() else ""  # otherwise a topic
         files = [path for path in (self.config, self.odometry, gnss) if path]
         labels = Path(self.labels.removeprefix(NETWORK))
         files += [str(labels)] if labels.is_absolute() and labels.exists() else []  # others are in the recording
+        if self.labels.startswith(NETWORK) and (settings := settings_file(labels)).exists():
+            options["network"] = read_settings(settings).model_dump(mode="json")
         return key_of(version, options, _state(Path(self.data)), *(_state(Path(file)) for file in files))
 
 

@@ -71,6 +71,18 @@ def test_the_key_changes_with_recording_options_and_version_but_not_with_the_nam
     assert drive.key("1") != key
 
 
+def test_a_drive_is_checked_as_in_a_list(tmp_path: Path) -> None:
+    """Its paths are absolute on return, because workers have other folders."""
+    drive = Drive("last", str(tmp_path), config=str(tmp_path / "c.yaml"), set=("odometry.max_range_m=60",))
+    assert drives_of([drive]) == [drive]
+    assert drives_of([replace(drive, data="a", labels="network:m.onnx")]) == [
+        replace(drive, data=str(Path("a").resolve()), labels=f"network:{Path('m.onnx').resolve()}")
+    ]
+    for name in ("../b", "a/b", ".a"):
+        with pytest.raises(SegslamError, match=re.escape(f"{tmp_path}: name {name!r}: use letters")):
+            drives_of([replace(drive, name=name)])
+
+
 def test_a_missing_recording_is_named(tmp_path: Path) -> None:
     with pytest.raises(SegslamError, match="nothing: no such file"):
         drives_of([tmp_path / "nothing"])[0].key("1")

@@ -94,11 +94,13 @@ def read_drives(file: Path) -> list[Drive]:
 
 
 def drives_of(data: Sequence["Drive | str | Path"], *, config: Path | None = None) -> list[Drive]:
-    """One drive for each recording, with the settings of a file."""
+    """One drive for each recording, with the settings of a file; a Drive has its own, and is checked as in a list."""
     options = {"config": str(config)} if config else {}
-    return _named(
-        [one if isinstance(one, Drive) else _drive({"data": str(one), **options}, str(one), Path.cwd()) for one in data]
-    )
+    entries = [
+        asdict(one) | {"data": str(one.data)} if isinstance(one, Drive) else {"data": str(one), **options}
+        for one in data
+    ]
+    return _named([_drive(entry, entry["data"], Path.cwd()) for entry in entries])
 
 
 def _drive(value: Any, where: str, folder: Path) -> Drive:
@@ -112,7 +114,7 @@ def _drive(value: Any, where: str, folder: Path) -> Drive:
     given = {"name": "", **{name: one for name, one in given.items() if one is not None}}
     settings = given.pop("set", [])
     settings = [settings] if isinstance(settings, str) else settings
-    if not isinstance(settings, list) or not all(isinstance(one, str) for one in settings):
+    if not isinstance(settings, list | tuple) or not all(isinstance(one, str) for one in settings):
         raise SegslamError(f"{where}: set: expected texts section.key=value, found {short(settings)}")
     texts = {name: _text(one, f"{where}: {name}") for name, one in given.items()}
     if texts.get("labels", "").startswith(NETWORK):

@@ -1,15 +1,18 @@
 """Fixes from NMEA 0183: GGA (position, height, quality) and RMC (position, date); others only give the date (ZDA)."""
 
+import math
 import re
 from collections.abc import Mapping, Sequence
-from datetime import UTC, date, datetime, time, timedelta
+from datetime import MAXYEAR, MINYEAR, UTC, date, datetime, time, timedelta
 from functools import reduce
-from itertools import pairwise
 from operator import xor
 from pathlib import Path
 
 from segslam.core.types import SegslamError
 from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
+
+LEAST_WORDS = {"GGA": 10, "RMC": 10, "ZDA": 5}
+"""Sentences that have a time, and up to which field they are read."""
 
 
 def is_nmea(lines: Sequence[str]) -> bool:
@@ -32,21 +35,10 @@ def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
     num_wrong = len(all_words) - len(sentences)
     if not sentences:
         raise SegslamError(f"{file}: all {num_wrong} NMEA sentences have wrong checksums; log them again")
-    # Without RMC or ZDA the times are those of a day.
-    day = next(filter(None, map(_date, sentences.values())), date(1970, 1, 1)) - _midnights_before_date(file, sentences)
-    last = None
-    for number, words in sentences.items():
-        kind = words[0][-3:]
-        named = _date(words) or day
-        if named != day:  # the date has passed midnight already
-            day, last = named, None
-        if kind not in found or len(words) < 10 or not words[1]:
-            continue
-        at = _time(file, number, words[1])
-        if last is not None and datetime.combine(day, last) - datetime.combine(day, at) > timedelta(hours=12):
-            day += timedelta(days=_date(words) is None)  # midnight, before the next date
-        last = at
-        found[kind].append(_row(file, number, kind, words, datetime.combine(day, at, tzinfo=UTC)))
+    for number, moment in _moments(file, sentences).items():
+        kind = sentences[number][0][-3:]
+        if kind in found:
+            found[kind].append(_row(file, number, kind, sentences[number], moment))
     left_out = f"; {num_wrong} lines with wrong checksums left out" if num_wrong else ""
     left_out += "" if is_checked else "; no line has a checksum"
     if not found["GGA"]:
@@ -55,15 +47,26 @@ def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
     return found["GGA"], f"heights: {heights}{left_out}"
 
 
-def _midnights_before_date(file: Path, sentences: Mapping[int, Sequence[str]]) -> timedelta:
-    """Days between the first sentence with a time and the first one with a date."""
-    times = []
-    for number, words in sentences.items():
-        if words[0][-3:] in ("GGA", "RMC", "ZDA") and len(words) > 1 and words[1]:
-            times.append(datetime.combine(date.min, _time(file, number, words[1])))
-        if _date(words) is not None:
-            return timedelta(days=sum(a - b > timedelta(hours=12) for a, b in pairwise(times)))
-    return timedelta()
+def _moments(file: Path, sentences: Mapping[int, Sequence[str]]) -> dict[int, datetime]:
+    """The moment of each sentence with a time; without a date, on the day that is nearest to the one before.
+
+    Before the first date, it is the day nearest to the one after; in a file without dates the first day is 1970-01-01.
+    """
+    timed = [
+        (number, _date(words), _time(file, number, words[1]))
+        for number, words in sentences.items()
+        if len(words) >= LEAST_WORDS.get(words[0][-3:], math.inf) and words[1]
+    ]
+    first = next((row for row, (_, day, _) in enumerate(timed) if day is not None), 0)
+    moments: dict[int, datetime] = {}
+    for part in (timed[first::-1], timed[first:]):
+        last = datetime(1970, 1, 1, 12, tzinfo=UTC)
+        for number, day, at in part:
+            moment = datetime.combine(day or last, time(), tzinfo=UTC) + at
+            if day is None:
+                moment += timedelta(days=round((last - moment) / timedelta(days=1)))
+            moments[number] = last = moment
+    return moments
 
 
 def _words(sentence: str) -> list[str] | None:
@@ -95,10 +98,13 @@ def _degrees(file: Path, number: int, text: str, hemisphere: str, digits: int) -
     return -degrees if hemisphere in ("S", "W") else degrees
 
 
-def _time(file: Path, number: int, text: str) -> time:
+def _time(file: Path, number: int, text: str) -> timedelta:
+    """The time since midnight; a leap second, 60, is the second after 59."""
     try:
         whole, _, fraction = text.partition(".")
-        return time(int(whole[:2]), int(whole[2:4]), int(whole[4:6]), int(fraction.ljust(6, "0")[:6] or 0))
+        second = int(whole[4:6])
+        at = time(int(whole[:2]), int(whole[2:4]), second - (second == 60), int(fraction.ljust(6, "0")[:6] or 0))
+        return datetime.combine(date.min, at) - datetime.min + timedelta(seconds=second == 60)
     except ValueError as error:
         raise bad_line(file, number, f"time {text[:20]} is not hhmmss.ss") from error
 
@@ -109,7 +115,7 @@ def _date(words: Sequence[str]) -> date | None:
         if words[0][-3:] == "RMC" and len(words) > 9:
             year = int(words[9][4:6])
             return date(year + (1900 if year > 79 else 2000), int(words[9][2:4]), int(words[9][:2]))
-        if words[0][-3:] == "ZDA" and len(words) > 4:
+        if words[0][-3:] == "ZDA" and len(words) > 4 and MINYEAR < int(words[4]) < MAXYEAR:
             return date(int(words[4]), int(words[3]), int(words[2]))
     except ValueError:
         return None

@@ -80,7 +80,10 @@ def _stamp(file: Path, number: int, first: str, second: str, *, clock: str) -> i
             moment = GPS_EPOCH + timedelta(weeks=week, seconds=int(seconds))
             return stamp_of(_utc(moment, clock)) + round((seconds - int(seconds)) * 1e9)
         whole, _, fraction = second.partition(".")
+        is_leap = whole.endswith(":60")  # the second after 59
+        whole = whole.removesuffix(":60") + ":59" * is_leap
         moment = datetime.strptime(f"{first} {whole}", "%Y/%m/%d %H:%M:%S").replace(tzinfo=UTC)
+        moment += timedelta(seconds=is_leap)
         return stamp_of(_utc(moment, clock)) + int(fraction.ljust(9, "0")[:9])
     except (ValueError, OverflowError) as error:
         what = f"time {first[:20]} {second[:20]} is neither week and seconds nor a date"

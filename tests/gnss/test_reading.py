@@ -363,6 +363,45 @@ def test_fixes_before_the_first_date_may_be_of_the_day_before(tmp_path: Path) ->
     assert np.diff(fixes.stamp_ns).tolist() == [2_000_000_000, 1_000_000_000]
 
 
+@pytest.mark.parametrize("dated", [None, 0, 3])
+def test_sentences_out_of_order_around_midnight_keep_their_day(dated: int | None, tmp_path: Path) -> None:
+    """`dated`: row before which the date is given; without dates the first day is in 1970."""
+    times, fix = ("235958.00", "000000.00", "235959.50", "000001.00"), "4800.0,N,00800.0,E,1,8,1,100,M,48,M,,"
+    contents = [f"GPGGA,{at},{fix}" for at in times]
+    days = ["31,01,2024", "01,02,2024", "31,01,2024", "01,02,2024"]
+    if dated is not None:
+        contents.insert(dated, f"GPZDA,{times[dated]},{days[dated]},00,00")
+    (tmp_path / "a.nmea").write_text("\n".join(map(sentence, contents)))
+    midnight = datetime(1970, 1, 2, tzinfo=UTC) if dated is None else datetime(2024, 2, 1, tzinfo=UTC)
+    since_ns = read_fixes(tmp_path / "a.nmea").stamp_ns - stamp_of(midnight)
+    assert since_ns.tolist() == [-2_000_000_000, -500_000_000, 0, 1_000_000_000]
+
+
+@pytest.mark.parametrize(("at", "day"), [("000001", "01,01,0001"), ("235959", "31,12,9999")])
+def test_a_date_whose_neighbour_does_not_exist_is_none(at: str, day: str, tmp_path: Path) -> None:
+    fix = "4800.0,N,00800.0,E,1,8,1,100,M,48,M,,"
+    contents = [f"GPGGA,{one}.00,{fix}" for one in ("235958", "000002")]
+    (tmp_path / "a.nmea").write_text("\n".join(map(sentence, [f"GPZDA,{at}.00,{day},00,00", *contents])))
+    assert np.diff(read_fixes(tmp_path / "a.nmea").stamp_ns).tolist() == [4_000_000_000]
+
+
+@pytest.mark.parametrize("kind", ["GGA", "RMC", "pos"])
+def test_a_leap_second_is_the_second_after_59(kind: str, tmp_path: Path) -> None:
+    place = "4800.0,N,00800.0,E"
+    lines = [
+        {
+            "GGA": sentence(f"GPGGA,{at.replace(':', '')},{place},1,8,1,100,M,48,M,,"),
+            "RMC": sentence(f"GPRMC,{at.replace(':', '')},A,{place},0,0,311216,,"),
+            "pos": f"2016/12/31 {at} 48.0 8.0 100.0 1 9",
+        }[kind]
+        for at in ("23:59:59.50", "23:59:60.25")
+    ]
+    header = {"GGA": sentence("GPZDA,235959.00,31,12,2016,00,00"), "pos": "%  UTC  latitude(deg) longitude(deg)"}
+    (tmp_path / "a.pos").write_text("\n".join([header.get(kind, ""), *lines]))
+    midnight_ns = stamp_of(datetime(2017, 1, 1, tzinfo=UTC))
+    assert (read_fixes(tmp_path / "a.pos").stamp_ns - midnight_ns).tolist() == [-500_000_000, 250_000_000]
+
+
 def test_seconds_and_nanoseconds_may_be_two_columns(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("sec,nanosec,lat,lon\n100,0,48,11\n100,500000000,48.1,11\n101,0,48.2,11\n")
     assert read_fixes(tmp_path / "a.csv").stamp_ns.tolist() == [100_000_000_000, 100_500_000_000, 101_000_000_000]

@@ -62,8 +62,7 @@ def _row(file: Path, number: int, words: Sequence[str], *, is_ecef: bool, clock:
         errors = np.array([number_in(file, number, word, "standard deviation") for word in words[7:10]])
     sigma_m = errors[[1, 0, 2]]  # north comes before east
     if is_ecef:
-        if np.isfinite(position).all():
-            position = geodetic_from_ecef(position[None])[0]
+        position = geodetic_from_ecef(position[None])[0] if np.isfinite(position).all() else np.full(3, np.nan)
         rotation = rotation_ecef_enu(Origin(*position.tolist()))
         sigma_m = np.sqrt((rotation.T**2) @ errors**2)  # without the correlations of the axes of ECEF
     latitude, longitude, height_m = position.tolist()

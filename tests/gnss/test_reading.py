@@ -322,6 +322,12 @@ def test_rtklib_may_write_other_clocks_and_degrees_in_parts(clock: str, at: str,
         np.testing.assert_allclose(fixes.places[0], [-48.1375, 11.581944444, 100.0], atol=1e-8)
 
 
+def test_one_unknown_coordinate_of_ecef_makes_a_fix_unusable(tmp_path: Path) -> None:
+    rows = [f"2024/05/01 00:00:0{row} {x} 606000.0 4790000.0 1 9" for row, x in enumerate(("4150000.0", "nan"))]
+    (tmp_path / "a.pos").write_text("\n".join(["%  GPST  x-ecef(m) y-ecef(m) z-ecef(m)", *rows]))
+    assert read_fixes(tmp_path / "a.pos").reasons == ("", "not_finite")
+
+
 def test_midnight_is_passed_without_a_fix(tmp_path: Path) -> None:
     fix = "4800.0,N,00800.0,E,1,8,1,100,M,48,M,,"
     sentences = (

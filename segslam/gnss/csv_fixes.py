@@ -1,11 +1,12 @@
 """Fixes from a CSV file: time, latitude, longitude, height, standard deviations.
 
 With a header the columns may be in any order and have one of several common names; without one they are in the order
-above. Separators are semicolons (then decimal commas are read), commas, tabs or blanks; text after # is ignored.
+above. Separators are semicolons (then decimal commas are read), commas, tabs or blanks; text after # is ignored, unless
+it is a header: the names of as many columns as the first fix has.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from decimal import Decimal
 from pathlib import Path
@@ -16,33 +17,21 @@ from segslam.core.errors import brief
 from segslam.core.types import SegslamError
 from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
 
-COLUMNS: dict[str, tuple[str, ...]] = {
-    "time": (
-        "header_stamp",
-        "time",
-        "t",
-        "seconds",
-        "timestamp",
-        "stamp",
-        "stamp_s",
-        "time_s",
-        "sec",
-        "secs",
-        "utc",
-        "unix_time",
-    ),
-    "time_ns": ("time_ns", "stamp_ns", "timestamp_ns", "nanoseconds"),
-    "fraction_ns": ("nanosec", "nanosecs", "nsec", "nsecs"),
-    "latitude": ("latitude", "latitude_deg", "lat", "lat_deg"),
-    "longitude": ("longitude", "longitude_deg", "lon", "lon_deg", "lng", "long"),
-    "height": ("height", "height_m", "altitude", "altitude_m", "alt", "alt_m", "h", "ellipsoidal_height", "ele"),
-    "sigma_east": ("sigma_east", "sigma_east_m", "sd_east", "sde", "std_lon", "sigma_e", "sigma_x"),
-    "sigma_north": ("sigma_north", "sigma_north_m", "sd_north", "sdn", "std_lat", "sigma_n", "sigma_y"),
-    "sigma_up": ("sigma_up", "sigma_up_m", "sd_up", "sdu", "std_alt", "sigma_u", "sigma_z", "vertical_accuracy"),
-    "sigma": ("sigma", "sigma_m", "accuracy", "horizontal_accuracy", "hacc", "std", "sd"),
-    "status": ("status", "status_status"),
-    "quality": ("quality", "fix", "valid"),
+COLUMNS = {
+    "time": "header_stamp time t seconds timestamp stamp stamp_s time_s sec secs utc unix_time",
+    "time_ns": "time_ns stamp_ns timestamp_ns nanoseconds",
+    "fraction_ns": "nanosec nanosecs nsec nsecs",
+    "latitude": "latitude latitude_deg lat lat_deg",
+    "longitude": "longitude longitude_deg lon lon_deg lng long",
+    "height": "height height_m altitude altitude_m alt alt_m h ellipsoidal_height ele",
+    "sigma_east": "sigma_east sigma_east_m sd_east sde std_lon sigma_e sigma_x",
+    "sigma_north": "sigma_north sigma_north_m sd_north sdn std_lat sigma_n sigma_y",
+    "sigma_up": "sigma_up sigma_up_m sd_up sdu std_alt sigma_u sigma_z vertical_accuracy",
+    "sigma": "sigma sigma_m accuracy horizontal_accuracy hacc std sd",
+    "status": "status status_status",
+    "quality": "quality fix valid",
 }
+"""Names of each column; the first that a file has counts."""
 ORDER = ("time", "latitude", "longitude", "height", "sigma_east", "sigma_north", "sigma_up")
 """Columns of a file without header."""
 NEEDED = ("latitude", "longitude")
@@ -58,15 +47,20 @@ def read_csv(file: Path, lines: Sequence[str]) -> list[Row]:
     content = [(number, line) for number, line in content if line.strip()]
     if not content:
         raise SegslamError(f"{file}: contains no line with a fix; give another file")
-    first = _cells(content[0][1])
+    number, line = content[0]
+    first = _cells(line)
     if any(re.search(r"[A-Za-z]{2}", cell) and cell.lower() not in ("nan", "null") for cell in first[1:]):
-        places = _places_by_name(file, content[0][0], first)
-        content = content[1:]
+        content, places = content[1:], _places(first)
+        if missing := _missing(places):
+            known = ", ".join(brief(name, 20) for name in first[:12])
+            raise bad_line(file, number, f"no column {' or '.join(missing)} among {known}", "name the columns so")
     else:
         if len(first) < 3:
-            what = f"{len(first)} columns"
-            raise bad_line(file, content[0][0], what, "give at least time, latitude, longitude")
-        places = {name: place for place, name in enumerate(ORDER) if place < len(first)}
+            raise bad_line(file, number, f"{len(first)} columns", "give at least time, latitude, longitude")
+        comments = (_cells(line.lstrip("# ")) for line in lines[: number - 1])
+        headers = (_places(cells) for cells in comments if len(cells) == len(first))
+        positions = {name: place for place, name in enumerate(ORDER) if place < len(first)}
+        places = next((named for named in headers if not _missing(named)), positions)
     return [_row(file, number, _cells(line), places) for number, line in content]
 
 
@@ -77,24 +71,24 @@ def _cells(line: str) -> list[str]:
     return line.split()
 
 
-def _places_by_name(file: Path, number: int, names: Sequence[str]) -> dict[str, int]:
+def _places(names: Sequence[str]) -> dict[str, int]:
+    """The place of each known column among the names of a header."""
     cleaned = [
         re.sub(r"[^a-z0-9_]", "", re.sub(r"[\[(].*|^field\.", "", name.lower()).strip().translate({32: "_", 46: "_"}))
         for name in names
     ]
-    places = {
+    return {
         column: cleaned.index(alias)
         for column, aliases in COLUMNS.items()
-        for alias in reversed(aliases)
+        for alias in reversed(aliases.split())
         if alias in cleaned
     }
-    missing = [name for name in NEEDED if name not in places]
-    if "time" not in places and "time_ns" not in places:
-        missing.insert(0, "time")
-    if missing:
-        known = ", ".join(brief(name, 20) for name in names[:12])
-        raise bad_line(file, number, f"no column {' or '.join(missing)} among {known}", "name the columns so")
-    return places
+
+
+def _missing(places: Mapping[str, int]) -> list[str]:
+    """The columns without which there is no fix."""
+    is_timed = "time" in places or "time_ns" in places
+    return [*([] if is_timed else ["time"]), *(name for name in NEEDED if name not in places)]
 
 
 def _row(file: Path, number: int, cells: Sequence[str], places: dict[str, int]) -> Row:

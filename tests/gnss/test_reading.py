@@ -455,6 +455,25 @@ def test_numbers_between_semicolons_may_have_decimal_commas(tmp_path: Path) -> N
     assert fixes.places.tolist() == [[48.25, 11.5, 500.5], [48.5, 11.5, 501.0]]
 
 
+@pytest.mark.parametrize(
+    ("header", "is_used"),
+    [
+        ("# time,lon,lat,alt", True),
+        ("#longitude units: degrees\n#Time;Lon (deg);Lat (deg);Alt", True),
+        (" ## time lon lat alt", True),
+        ("# columns: time lon lat alt", False),
+        ("# lon, lat, alt, other", False),
+        ("# first drive, with the new receiver", False),
+    ],
+)
+def test_a_header_may_be_a_comment(header: str, is_used: bool, tmp_path: Path) -> None:
+    """Other comments are ignored, and the columns are in the order of a file without header."""
+    (tmp_path / "a.csv").write_text(f"{header}\n# by hand\n1,11.5,48.25,500 # start\n2,11.6,48.5,501\n")
+    places = read_fixes(tmp_path / "a.csv").places
+    order = [1, 0, 2] if is_used else [0, 1, 2]
+    np.testing.assert_array_equal(places, np.array([[11.5, 48.25, 500.0], [11.6, 48.5, 501.0]])[:, order])
+
+
 def test_a_recording_may_end_in_capitals(tmp_path: Path) -> None:
     assert len(read_fixes(write_mcap(tmp_path / "DRIVE.MCAP"))) == 3
 

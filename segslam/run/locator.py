@@ -62,10 +62,10 @@ class Located(Found):
 class Locator:
     """Locates scans among the keyframes of a finished run, which is not changed."""
 
-    def __init__(self, session: Session) -> None:
-        """`session`: the run. Signatures of its keyframes that it does not have are computed."""
+    def __init__(self, session: Session, config: Config | None = None) -> None:
+        """`session`: the run; `config`: settings, by default its own. Signatures that it does not have are computed."""
         self.session = session
-        self.config = session.run.config
+        self.config = config or session.run.config
         self.submaps = submaps_of(session, self.config)
         self.prepared: Callable[[int], PreparedScan] = lru_cache(NUM_PREPARED)(self.submaps.prepared)
         """A keyframe by its id, prepared for alignment."""

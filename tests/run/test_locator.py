@@ -13,10 +13,14 @@ from helpers.drives import drifting, round_drive, round_sweeps, write_kitti_sequ
 import segslam
 from segslam.core import geometry
 from segslam.core.config import load_config
-from segslam.core.types import Rejected, SegslamError, Step
+from segslam.core.types import Rejected, RejectReason, SegslamError, Step
+from segslam.labels import geometric_labels
 from segslam.odometry.sweep import GivenOdometry
 from segslam.output.log import read_log, reader
 from segslam.run.locator import Locator, submaps_of
+from segslam.run.sessions import session_pose
+from segslam.run.sessions.localiser import Localiser
+from segslam.run.sessions.merge import plan
 from segslam.run.sessions.recorded import read_session
 from segslam.slam.slam_result import SlamResult
 
@@ -50,6 +54,23 @@ def test_scans_of_a_second_round_are_found_under_any_yaw(run: Path) -> None:
         apart = np.linalg.inv(T_world_first @ truth.T_world_lidar[number] @ T_lidar_turned) @ found.T_world_lidar
         assert geometry.distance(apart) < 0.5  # of which the odometry has a part: 1 cm a step
         assert geometry.angle(apart) < np.radians(2.0)
+
+
+@pytest.mark.long
+def test_the_settings_of_a_drive_decide_in_the_map_of_another(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """When it is merged or localised, a location is accepted by its own `verify.max_false_share`."""
+    session, scan = read_session(run), round_drive()[0][52]
+    config = session.run.config
+    strict = config.model_copy(update={"verify": config.verify.model_copy(update={"max_false_share": 1e-12})})
+    reasons = []
+    for settings in (config, strict):
+        step = Localiser(Locator(session), settings, labeller=geometric_labels).process(scan)
+        assert step.not_placed is not None
+        reasons.append(step.not_placed.reason)
+    assert reasons == [RejectReason.UNCONFIRMED, RejectReason.IMPROBABLE]
+    monkeypatch.setattr(session_pose, "NUM_QUERIES", 1)
+    with pytest.raises(SegslamError, match=r"not found in any other run .* 0 of 1 keyframes"):
+        plan([session, session], config=strict)
 
 
 @pytest.mark.long

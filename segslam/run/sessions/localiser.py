@@ -44,8 +44,10 @@ class Localiser(Slam):
         odometry: Odometry | None = None,
         labeller: Labeller | None = None,
     ) -> None:
-        """`locator` belongs to the existing map; other arguments as for `Slam`."""
+        """`locator` belongs to the existing map, where `config` is used, too; other arguments as for `Slam`."""
         super().__init__(config, odometry=odometry, labeller=labeller)
+        if locator.config != self.config:
+            locator = Locator(locator.session, self.config)
         self._placer = Placer(self.config, locator, self._anchored, self._loops.submaps)
         self._placed: tuple[tuple[Placement, ...], Rejected | None] = (), None
 

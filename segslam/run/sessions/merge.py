@@ -133,7 +133,7 @@ def plan(
 
     @cache
     def locator(number: int) -> Locator:
-        return Locator(sessions[number])
+        return Locator(sessions[number], config)
 
     @cache
     def related(later: int, earlier: int) -> Relation:

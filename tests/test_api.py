@@ -49,6 +49,17 @@ def test_points_and_a_stamp_are_a_scan() -> None:
     assert np.shares_memory(segslam.Scan(kept, 0).points, kept)
 
 
+def test_labels_times_and_intensities_may_be_lists() -> None:
+    scan = round_drive()[0][0]
+    num = len(scan.points)
+    lists = segslam.Scan(scan.points, 0, None, scan.labels.tolist(), [0.0] * num, [0.5] * num)
+    keyframe = segslam.Slam().process(lists).keyframe
+    assert keyframe is not None
+    assert len(keyframe.labels) == len(keyframe.points) > 0
+    found = segslam.register(scan.points, scan.points, source_labels=scan.labels.tolist(), target_labels=scan.labels)
+    assert not isinstance(found, segslam.Rejected)
+
+
 @pytest.mark.parametrize("points", [np.zeros((4, 2)), np.zeros(6), [["x", "y", "z"]]])
 def test_other_arrays_than_points_are_rejected(points: object) -> None:
     with pytest.raises(segslam.SegslamError, match="points:"):
@@ -166,6 +177,9 @@ WRONG_KINDS = {
     "segslam.Scan(np.ones((5, 3)), 0.5)": "stamp_ns 0.5: give integer nanoseconds",
     "segslam.Scan(np.ones((5, 3)), 0, times=np.ones(3))": "3 times for 5 points",
     "segslam.Scan(np.ones((5, 3)), 0, labels=np.ones(2, np.uint8))": "2 labels for 5 points",
+    "segslam.Scan(np.ones((5, 3)), 0, labels=['road'] * 5)": "labels: not an array of numbers",
+    "segslam.Scan(np.ones((2, 3)), 0, labels=[9, 65545])": "labels: 65545 is not a learning id",
+    "segslam.Scan(np.ones((5, 3)), 0, intensities=np.ones(3))": "intensities: 3 for 5 points",
     "segslam.evaluate(np.eye(4)[None], np.eye(4)[None], align='Sim3')": "align='Sim3': unknown; known: se3",
     "segslam.fleet('~unknown-user/drives.yaml', 'fleet')": "there is no user with this name",
     "segslam.read_run('scan.bin')": "not a run",

@@ -87,10 +87,21 @@ def as_points(points: ArrayLike) -> Points:
     return array[:, :3]
 
 
-def check_labels(labels: Labels | None, points: Points) -> None:
-    """Raises SegslamError unless there are no labels, or one for each point."""
-    if labels is not None and np.shape(labels) != (len(points),):
-        raise SegslamError(f"labels: {np.size(labels)} labels for {len(points)} points; give one for each")
+def as_labels(labels: ArrayLike | None, points: Points) -> Labels | None:
+    """Learning ids as an array; None without labels. Raises SegslamError unless they are one for each point."""
+    if labels is None:
+        return None
+    try:
+        array = np.asarray(labels)
+        with np.errstate(invalid="ignore"):
+            ids = array.astype(np.uint8, copy=False)
+    except (TypeError, ValueError) as error:
+        raise SegslamError(f"labels: not an array of numbers ({error}); give one for each point") from error
+    if array.shape != (len(points),):
+        raise SegslamError(f"labels: {array.size} labels for {len(points)} points; give one for each")
+    if not np.array_equal(array, ids):
+        raise SegslamError(f"labels: {array[array != ids][0]} is not a learning id; give integers from 0 to 255")
+    return ids
 
 
 class Label(IntEnum):
@@ -172,25 +183,27 @@ class Scan(Record):
         points: ArrayLike,
         stamp_ns: int,
         index: int | None = None,
-        labels: ScanLabels | None = None,
-        times: Vector | None = None,
-        intensities: Vector | None = None,
+        labels: ScanLabels | ArrayLike | None = None,
+        times: ArrayLike | None = None,
+        intensities: ArrayLike | None = None,
         kept: Mask | None = None,
     ) -> None:
-        """`points`: array-like with at least 3 columns; the first 3 are used.
+        """`points`: array-like with at least 3 columns; the first 3 are used. The others may be array-like, too.
 
-        Raises SegslamError for another shape, for a stamp that is no integer, and for labels or times that are not one
-        for each point.
+        Raises SegslamError for another shape, for a stamp that is no integer, and for labels, times or intensities that
+        are not one for each point.
         """
         xyz = as_points(points)
         if not isinstance(stamp_ns, int | np.integer):
             raise SegslamError(f"stamp_ns {stamp_ns!r}: give integer nanoseconds")
-        if labels is not None and not callable(labels):
-            check_labels(labels, xyz)
-        if times is not None and len(times) not in (0, len(xyz)):
-            raise SegslamError(f"times: {len(times)} times for {len(xyz)} points; give one for each, or none")
+        labels = labels if callable(labels) else as_labels(labels, xyz)
         labels = np.zeros(len(xyz), np.uint8) if labels is None else labels
-        times = np.empty(0) if times is None else times
+        times = np.empty(0) if times is None else np.asarray(times)
+        if len(times) not in (0, len(xyz)):
+            raise SegslamError(f"times: {len(times)} times for {len(xyz)} points; give one for each, or none")
+        intensities = None if intensities is None else np.asarray(intensities)
+        if intensities is not None and len(intensities) != len(xyz):
+            raise SegslamError(f"intensities: {len(intensities)} for {len(xyz)} points; give one for each")
         values = (xyz, stamp_ns, index, labels, times, intensities, kept)
         for one, value in zip(fields(self), values, strict=True):
             object.__setattr__(self, one.name, value)

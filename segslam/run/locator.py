@@ -20,8 +20,8 @@ from segslam.core.types import (
     Rejected,
     RejectReason,
     Transform,
+    as_labels,
     as_points,
-    check_labels,
 )
 from segslam.graph import PoseGraph
 from segslam.keyframes import Submaps, downsample_keyframe
@@ -80,7 +80,7 @@ class Locator:
         return cls(read_session(Path(folder)))
 
     def locate(
-        self, points: ArrayLike, labels: Labels | None = None, *, max_places: int = MAX_PLACES
+        self, points: ArrayLike, labels: ArrayLike | None = None, *, max_places: int = MAX_PLACES
     ) -> Located | Rejected:
         """The pose of a scan, or the reason why it was not found. `points`: rows of x, y, z in the sensor's frame (m).
 
@@ -91,12 +91,12 @@ class Locator:
         started = perf_counter()
         config = self.config
         near = as_points(points)
-        check_labels(labels, near)
+        known = as_labels(labels, near)
         usable = within_range(near, config.odometry.min_range_m, config.odometry.max_range_m)
         near = near.compress(usable, axis=0)
-        labels = geometric_labels(near) if labels is None else labels[usable]
+        classes = geometric_labels(near) if known is None else known[usable]
         kept, kept_labels, _ = downsample_keyframe(
-            near, labels, config=config.keyframes, whole_classes=tuple(config.segregator.cluster_min_points)
+            near, classes, config=config.keyframes, whole_classes=tuple(config.segregator.cluster_min_points)
         )
         scan, (own, candidates) = at_once(
             lambda: prepare_scan(kept, kept_labels, config=config), lambda: self._candidates(kept, kept_labels)
@@ -131,6 +131,6 @@ def submaps_of(session: Session, config: Config) -> Submaps:
     return submaps
 
 
-def locate(run: str | Path, points: ArrayLike, labels: Labels | None = None) -> Located | Rejected:
+def locate(run: str | Path, points: ArrayLike, labels: ArrayLike | None = None) -> Located | Rejected:
     """Locate a scan in the run of a folder. For several scans, create a `Locator` once, because it reads the run."""
     return Locator.from_run(run).locate(points, labels)

@@ -11,13 +11,12 @@ from segslam.core.config import Config, check_config
 from segslam.core.threads import Stopwatch, at_once
 from segslam.core.types import (
     Alignment,
-    Labels,
     Registration,
     Rejected,
     RejectReason,
     Transform,
+    as_labels,
     as_points,
-    check_labels,
 )
 from segslam.labels import geometric_labels
 from segslam.registration import refinement
@@ -30,8 +29,8 @@ def register(
     source_points: ArrayLike,
     target_points: ArrayLike,
     *,
-    source_labels: Labels | None = None,
-    target_labels: Labels | None = None,
+    source_labels: ArrayLike | None = None,
+    target_labels: ArrayLike | None = None,
     config: Config | None = None,
 ) -> Alignment | Rejected:
     """The pose of one scan in another without an initial guess, each in its own sensor's frame (z up, metres).
@@ -43,9 +42,9 @@ def register(
     check_config(config)
     config = config or Config()
 
-    def prepared(given: ArrayLike, labels: Labels | None) -> PreparedScan:
+    def prepared(given: ArrayLike, given_labels: ArrayLike | None) -> PreparedScan:
         points = as_points(given)
-        check_labels(labels, points)
+        labels = as_labels(given_labels, points)
         return prepare_scan(points, geometric_labels(points) if labels is None else labels, config=config)
 
     source, target = at_once(

@@ -61,9 +61,12 @@ def anywhere(T_target_source: Transform, *, slack_m: float) -> Rejected | None:
     return None
 
 
-@lru_cache(1)
+@lru_cache(2)
 def _ranked_plans(source: PreparedScan, target: PreparedScan) -> Iterator[Registration]:
-    """Poses by the floor plans, the best first; copies start again, so that rivals need no other search."""
+    """Poses by the floor plans, the best first; copies start again, so that rivals need no other search.
+
+    Kept for two pairs: two threads try a scan at different places at the same time (`slam.recognition`).
+    """
     (plans,) = tee(segregator.plan_hypotheses(_floor_plan(source), _floor_plan(target), num_poses=MOST_PLANS), 1)
     return plans
 

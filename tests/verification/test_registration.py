@@ -189,6 +189,18 @@ def test_the_first_iterations_decide_whether_a_rival_is_refined(
     assert (led is not None, len(refined)) == (leads, num_refined)
 
 
+def test_floor_plans_of_two_pairs_at_the_same_time_are_searched_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    source, target, _ = _round_pair()
+    trials = [Trial(*scans, CONFIG, anywhere, Stopwatch()) for scans in ((source, target), (target, source))]
+    searched, search = [], segregator.plan_hypotheses
+    monkeypatch.setattr(
+        segregator, "plan_hypotheses", lambda *given, **named: searched.append(1) or search(*given, **named)
+    )
+    first, second = ([one.plans_near() for one in trials] for _ in range(2))
+    assert len(searched) == 2
+    assert [len(plans) for plans in first] == [len(plans) for plans in second] != [0, 0]
+
+
 def _found_pose() -> tuple[Trial, Found]:
     source, target, _ = _round_pair()
     trial = Trial(source, target, CONFIG, anywhere, Stopwatch())

@@ -12,7 +12,7 @@ from segslam.core import geometry
 from segslam.core.config import SegregatorConfig
 from segslam.core.types import Description, Label, Registration, Rejected, RejectReason, Transform
 from segslam.registration.segregator import descent, gaussians
-from segslam.registration.segregator.match import hypotheses, match, vertical
+from segslam.registration.segregator.match import hypotheses, match, upward, vertical
 
 MATCH = import_module("segslam.registration.segregator.match")
 """The module; the package has a function of this name."""
@@ -326,6 +326,15 @@ def test_patches_of_slopes_and_walls_do_not_turn_the_vertical() -> None:
     assert math.degrees(math.acos(up[2])) < 1.5, "the mean of the normals is off by 16 degrees"
 
 
+def test_four_walls_that_are_labelled_as_ground_show_no_vertical() -> None:
+    normals = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]] * 2)
+    np.testing.assert_array_equal(_vertical_of(normals), [0.0, 0.0, 1.0])
+    assert upward(_ground_of(normals)) is None
+
+
 def _vertical_of(normals: np.ndarray) -> np.ndarray:
-    nothing = np.empty((0, 3, 3)), np.empty(0)
-    return vertical(description(NO_ROWS, *nothing, np.zeros((len(normals), 3)), normals))
+    return vertical(_ground_of(normals))
+
+
+def _ground_of(normals: np.ndarray) -> Description:
+    return description(NO_ROWS, np.empty((0, 3, 3)), np.empty(0), np.zeros((len(normals), 3)), normals)

@@ -129,10 +129,11 @@ def _solve(
 
 
 def upward(description: Description) -> Direction | None:
-    """Upward unit vector from the normals of the ground; None if too little ground is visible."""
+    """Upward unit vector from the normals of the ground; None if too little ground is visible, or it has no middle."""
     if len(description.ground_normals) < MIN_GROUND_PATCHES:
         return None
-    return _middle(description.ground_normals)
+    middle = _middle(description.ground_normals)
+    return middle if middle.any() else None
 
 
 def vertical(description: Description) -> Direction:
@@ -152,6 +153,9 @@ def vertical(description: Description) -> Direction:
 
 
 def _middle(normals: Points) -> Direction:
-    """Unit vector of the medians of the components: patches of slopes and walls do not move it, as they do the mean."""
+    """Unit vector of the medians of the components: patches of slopes and walls do not move it, as they do the mean.
+
+    Zero if all medians are, as of four walls that are labelled as ground.
+    """
     middle = np.median(normals.astype(np.float64), axis=0)
-    return middle / np.linalg.norm(middle)
+    return middle / (np.linalg.norm(middle) or 1.0)

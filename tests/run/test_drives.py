@@ -71,6 +71,34 @@ def test_the_key_changes_with_recording_options_and_version_but_not_with_the_nam
     assert drive.key("1") != key
 
 
+@pytest.mark.parametrize(
+    ("data", "changed"),
+    [
+        ("linked", "whole/velodyne/0.bin"),
+        ("whole/velodyne", "whole/labels/0.label"),
+        ("whole/velodyne", "whole/times.txt"),
+        ("whole/velodyne", "whole/poses.txt"),
+        ("os1.pcap", "os1.json"),
+    ],
+)
+def test_the_key_changes_with_linked_folders_and_what_is_beside_the_data(
+    data: str, changed: str, tmp_path: Path
+) -> None:
+    for file in ("whole/velodyne/0.bin", "whole/labels/0.label", "whole/times.txt", "whole/poses.txt"):
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_bytes(b"1")
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked" / "velodyne").symlink_to(tmp_path / "whole" / "velodyne")
+    (tmp_path / "whole" / "velodyne" / "again").symlink_to(tmp_path / "linked")  # a circle
+    for name in ("os1.pcap", "os1.json"):
+        (tmp_path / name).write_bytes(b"1")
+    (drive,) = drives_of([tmp_path / data])
+    key = drive.key("1")
+    assert drive.key("1") == key
+    (tmp_path / changed).write_bytes(b"12")
+    assert drive.key("1") != key
+
+
 def test_a_drive_is_checked_as_in_a_list(tmp_path: Path) -> None:
     """Its paths are absolute on return, because workers have other folders."""
     drive = Drive("last", str(tmp_path), config=str(tmp_path / "c.yaml"), set=("odometry.max_range_m=60",))

@@ -5,7 +5,7 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -46,11 +46,17 @@ class Drive:
         options = {name: value for name, value in asdict(self).items() if name not in ("name", "data")}
         gnss = self.gnss if self.gnss and Path(self.gnss).exists() else ""  # otherwise a topic
         files = [path for path in (self.config, self.odometry, gnss) if path]
+        data = Path(self.data)
+        beside = [data.with_suffix(".json")] if data.suffix.lower() == ".pcap" else []  # metadata of the sensor
+        if data.name == "velodyne":
+            folder = "labels" if self.labels == "auto" else self.labels
+            beside = [data.parent / name for name in (folder, "times.txt", "poses.txt")]
+        files += [str(file) for file in beside if file.exists()]
         labels = Path(self.labels.removeprefix(NETWORK))
         files += [str(labels)] if labels.is_absolute() and labels.exists() else []  # others are in the recording
         if self.labels.startswith(NETWORK) and (settings := settings_file(labels)).exists():
             options["network"] = read_settings(settings).model_dump(mode="json")
-        return key_of(version, options, _state(Path(self.data)), *(_state(Path(file)) for file in files))
+        return key_of(version, options, _state(data), *(_state(Path(file)) for file in files))
 
 
 OPTIONS = tuple(field.name for field in fields(Drive))
@@ -69,11 +75,21 @@ def _state(path: Path) -> list[tuple[str, int, int]]:
         if path.is_file():
             files = [path]
         else:
-            files = sorted(Path(folder) / name for folder, _, names in os.walk(path, onerror=_raise) for name in names)
+            files = sorted(Path(folder) / name for folder, names in _walked(path) for name in names)
         states = [(file, file.stat()) for file in files]
     except OSError as error:
         raise SegslamError(f"{unreadable(path, 'recording', error)}; correct the list of drives") from error
     return [(os.path.relpath(file, path), state.st_size, state.st_mtime_ns) for file, state in states]
+
+
+def _walked(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Each folder within a folder, with the names of its files; links to folders are followed, each folder once."""
+    walked = {os.path.realpath(path)}
+    for folder, within, names in os.walk(path, onerror=_raise, followlinks=True):
+        real = {os.path.realpath(os.path.join(folder, name)): name for name in sorted(within)}
+        within[:] = [name for target, name in real.items() if target not in walked]
+        walked |= set(real)
+        yield folder, names
 
 
 def _raise(error: OSError) -> None:

@@ -330,3 +330,27 @@ def test_kept_results_belong_to_drives_of_these_names(tmp_path: Path) -> None:
     for name in ("scans", "scans-1"):
         found = steps.propose(tmp_path, steps.Mapped("other", "key"), [steps.Mapped(name, "key")])
         assert set(found) == {name}
+
+
+@pytest.mark.parametrize("content", [b"", b"\x93NUMPY", b"[1"])
+@pytest.mark.parametrize("kept", ["index/monday-key.npy", "index/friday-key.npy", "proposals/friday-{}.json"])
+def test_a_damaged_file_is_named_with_the_remedy(kept: str, content: bytes, tmp_path: Path) -> None:
+    """As after a power failure; it is not made again, so the same call would fail again."""
+    monday, friday = (steps.Mapped(name, "key") for name in ("monday", "friday"))
+    for drive in (monday, friday):
+        drive.signatures(tmp_path).parent.mkdir(exist_ok=True)
+        np.save(drive.signatures(tmp_path), np.zeros((2, 24, 60), np.uint8))
+    file = tmp_path / kept.format(steps.key_of([("monday", "key"), ("friday", "key")]))
+    file.parent.mkdir(exist_ok=True)
+    file.write_bytes(content)
+    failure = workers.attempted(steps.propose, tmp_path, friday, [monday]).failure
+    assert failure is not None
+    assert failure.startswith(f"{file}: damaged (")
+    assert failure.endswith("remove it, and call `segslam fleet` again")
+
+
+def test_an_error_without_text_is_a_failure_with_its_name() -> None:
+    def lost() -> None:
+        raise ConnectionResetError
+
+    assert workers.attempted(lost) == (None, "ConnectionResetError")

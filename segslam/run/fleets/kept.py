@@ -6,6 +6,7 @@ With the alignments, a component is adjusted again quickly.
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -91,7 +92,14 @@ def write_kept(file: Path, kind: Any, value: Any) -> None:
 
 def read_kept(file: Path, kind: Any) -> Any:
     """Raises SegslamError, naming the file, if it is damaged."""
-    try:
+    with unless_damaged(file):
         return codec(kind).decode(json.loads(file.read_text(encoding="utf-8")), {})
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+
+
+@contextmanager
+def unless_damaged(file: Path) -> Iterator[None]:
+    """Context manager in which a file is read that a fleet keeps. Raises SegslamError, naming it, if it is damaged."""
+    try:
+        yield
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError) as error:
         raise SegslamError(f"{file}: damaged ({error!r}); remove it, and call `segslam fleet` again") from error

@@ -6,7 +6,7 @@ A step writes its result beside the final name and renames it when it is whole. 
 import json
 import logging
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from importlib.metadata import version
@@ -26,7 +26,7 @@ from segslam.output.folder import write_poses
 from segslam.output.georeferenced import georeference, summary
 from segslam.output.log import read_log
 from segslam.run.fleets.drives import Drive, key_of
-from segslam.run.fleets.kept import Alignments, KeptAlignment, part_of, read_kept, write_kept
+from segslam.run.fleets.kept import Alignments, KeptAlignment, part_of, read_kept, unless_damaged, write_kept
 from segslam.run.locator import Locator
 from segslam.run.map_folder import given_odometry, map_folder, open_scans
 from segslam.run.sessions.merge import arranged, write_merged
@@ -135,23 +135,32 @@ def propose(fleet: Path, drive: Mapped, earlier: Sequence[Mapped]) -> Likely:
     if not file.exists():
         proposed = _proposed(fleet, drive, earlier)
         _replace(file, lambda part: part.write_text(json.dumps(proposed), encoding="utf-8"))
-    found = json.loads(file.read_text(encoding="utf-8"))
-    return {name: [(keyframe_id, score) for keyframe_id, score in likely] for name, likely in found.items()}
+    with unless_damaged(file):
+        found = json.loads(file.read_text(encoding="utf-8"))
+        return {name: [(keyframe_id, score) for keyframe_id, score in likely] for name, likely in found.items()}
 
 
 def _proposed(fleet: Path, drive: Mapped, earlier: Sequence[Mapped]) -> Likely:
     places, owners = Places(), list[str]()
     for other in earlier:
-        for spectrum in np.load(other.signatures(fleet), mmap_mode="r"):
-            places.add(len(owners), PlaceSignature(np.asarray(spectrum)))
+        for signature in _signatures(fleet, other):
+            places.add(len(owners), signature)
             owners.append(other.name)
     likely: dict[str, dict[int, float]] = {}
-    for keyframe_id, spectrum in enumerate(np.load(drive.signatures(fleet), mmap_mode="r")):
-        for similar in places.shortlist(PlaceSignature(np.asarray(spectrum))):
+    for keyframe_id, signature in enumerate(_signatures(fleet, drive)):
+        for similar in places.shortlist(signature):
             likely.setdefault(owners[similar.place_id], {}).setdefault(keyframe_id, similar.score)  # best first
     return {
         name: sorted(scores.items(), key=lambda one: -one[1])[:MOST_LIKELY] for name, scores in sorted(likely.items())
     }
+
+
+def _signatures(fleet: Path, drive: Mapped) -> Iterator[PlaceSignature]:
+    """The signatures of all keyframes of a run. Raises SegslamError, naming the file, if it is damaged."""
+    file = drive.signatures(fleet)
+    with unless_damaged(file):
+        spectra = np.load(file, mmap_mode="r")
+    return (PlaceSignature(np.asarray(spectrum)) for spectrum in spectra)
 
 
 def relate(fleet: Path, later: Mapped, earlier: Mapped, queries: Sequence[int]) -> Relation:

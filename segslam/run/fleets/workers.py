@@ -43,7 +43,7 @@ def attempted(function: Callable[..., Any], *arguments: Any) -> Outcome:
     try:
         return Outcome(function(*arguments))
     except (SegslamError, OSError) as error:
-        return Outcome(None, str(error))
+        return Outcome(None, str(error) or type(error).__name__)
     except Exception as error:
         logger.exception("%s failed", function.__name__)
         return Outcome(None, f"{type(error).__name__}: {error}")

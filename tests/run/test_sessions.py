@@ -22,6 +22,7 @@ from segslam.core.types import LoopClosure, MotionState, Trajectory
 from segslam.gnss import enu_from_geodetic
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.log import read_log
+from segslam.run.sessions.figures import Part, figures_of
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("short_runs")]
 
@@ -89,6 +90,11 @@ def test_two_days_become_one_frame(days: Days, merged: FinishedRun) -> None:
     assert merged.metrics["num_loops_between"] >= 3
     assert merged.metrics["num_loops_false"] == 0
     assert merged.metrics["num_motions_broken"] == 0
+
+
+def test_the_way_between_the_sessions_of_a_run_does_not_count_if_it_is_merged_again(merged: FinishedRun) -> None:
+    as_one = Part(first_keyframe=0, num_scans=len(merged.result.trajectory))
+    assert figures_of([as_one], merged.result)["length_m"] == pytest.approx(merged.metrics["length_m"])
 
 
 def test_scans_and_stamps_of_the_second_session_follow_the_first(days: Days, merged: FinishedRun) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from segslam.core.errors import brief
 from segslam.core.trajectory import travelled_m
-from segslam.core.types import REJECTED_WEIGHT, SegslamError
+from segslam.core.types import REJECTED_WEIGHT, MotionState, SegslamError
 from segslam.slam.slam import SlamResult
 
 
@@ -28,7 +28,10 @@ def parts_in(text: str) -> list[Part]:
 
 
 def figures_of(sessions: Sequence[Part], result: SlamResult) -> dict[str, Any]:
-    """The figures of a merged run, and its length without the way from one session to the next."""
+    """The figures of a merged run, and its length without the way from one session to the next.
+
+    A session may be a merged run itself, whose own sessions begin with such motions.
+    """
     first_ids = [session.first_keyframe for session in sessions[1:]]
     between = [
         weight
@@ -36,7 +39,8 @@ def figures_of(sessions: Sequence[Part], result: SlamResult) -> dict[str, Any]:
         if len(set(np.searchsorted(first_ids, ids, side="right").tolist())) > 1
     ]
     ends = np.cumsum([session.num_scans for session in sessions])
-    drives = np.split(result.trajectory.T_world_lidar, ends[:-1])
+    begun = [row for row, motion in enumerate(result.motions) if motion.state is MotionState.BEGUN]
+    drives = np.split(result.trajectory.T_world_lidar, np.unique([*ends[:-1], *begun]).astype(int))
     return {
         "num_sessions": len(sessions),
         "length_m": sum(float(travelled_m(drive)[-1]) for drive in drives if len(drive)),

@@ -8,7 +8,7 @@ import typer
 
 from segslam.cli.checks import check_free, check_links
 from segslam.cli.console import Terminal
-from segslam.cli.options import OverwriteOption
+from segslam.cli.options import MOST_OFFSET_S, OverwriteOption
 from segslam.cli.tables import TableFiles, as_text, with_meanings
 from segslam.core.errors import SegslamError
 
@@ -18,12 +18,15 @@ class Scoring:
     """How poses are read, matched and aligned."""
 
     format: Annotated[
-        Literal["kitti", "tum"] | None, "Format of both files; detected from the number of columns by default."
+        Literal["kitti", "tum"] | None, "Format of the files; detected from the number of columns by default."
     ] = None
     up: Annotated[
         Literal["z", "-y"] | None, "Upward axis of the two files: z, or -y for cameras; by default found from the path."
     ] = None
-    max_difference: Annotated[float, "Largest time difference between a pose and its reference (s)."] = 0.01
+    max_difference: Annotated[
+        float,
+        typer.Option(min=0, max=MOST_OFFSET_S, help="Largest time difference between a pose and its reference (s)."),
+    ] = 0.01
     align: Annotated[
         Literal["se3", "sim3", "first", "none"],
         "Alignment: rigid (se3), with scale (sim3), of the first pose (first), or none.",
@@ -97,10 +100,17 @@ def _score_run(
     from segslam.output.folder import folder_of, write_metrics
     from segslam.run.evaluate import matched_poses
 
+    if how.up == "-y":
+        raise SegslamError("--up -y: only for two files, because the poses of a run have z up; omit the option")
+    if reference_file is None and (how.format or how.max_difference != Scoring.max_difference):
+        raise SegslamError("--format, --max-difference: only for poses of a file; give one with --reference")
     folder = folder_of(folder)
     check_links(folder)
     run = read_run(folder)
-    reference = run.reference if reference_file is None else true_poses(reference_file, run)
+    reference = run.reference
+    if reference_file is not None:
+        limit_ns = round(how.max_difference * 1e9)
+        reference = true_poses(reference_file, run, format=how.format, max_difference_ns=limit_ns)
     if reference is None:
         raise SegslamError(f"{folder}: the data has no ground-truth poses; give a file with --reference")
     figures = accuracy(run.result, reference)

@@ -10,7 +10,7 @@ import numpy as np
 
 from segslam.core.config import Config
 from segslam.core.errors import unreadable
-from segslam.core.trajectory import lidar_from_camera, read_poses, rows_of_same_stamp
+from segslam.core.trajectory import PoseFormat, lidar_from_camera, read_poses, rows_of_same_stamp
 from segslam.core.types import LoopAttempt, Motion, SegslamError, Trajectory, Transform
 from segslam.output.folder import ALONE, folder_of, read_alone, read_localised
 from segslam.output.log import RunLog, read_log
@@ -107,13 +107,15 @@ def _checked_metrics(values: Any) -> dict[str, Any]:
     return known
 
 
-def true_poses(file: Path, run: FinishedRun) -> Trajectory:
+def true_poses(
+    file: Path, run: FinishedRun, *, format: PoseFormat | None = None, max_difference_ns: int = STAMP_TOLERANCE_NS
+) -> Trajectory:
     """Ground-truth LiDAR poses of the scans of a run, from a KITTI or TUM file.
 
     KITTI rows are matched by scan number; they are camera poses if the data of the run is KITTI's. TUM rows are matched
     by stamp. Raises SegslamError if no scan has a pose, or if the number of KITTI rows does not match the run.
     """
-    poses, scans = read_poses(file), run.result.trajectory
+    poses, scans = read_poses(file, format=format), run.result.trajectory
     T_world_lidar = poses.T_a_b
     if poses.stamp_ns is None:
         _check_length(file, len(poses), run)
@@ -121,7 +123,7 @@ def true_poses(file: Path, run: FinishedRun) -> Trajectory:
         if run.T_camera_lidar is not None:
             T_world_lidar = lidar_from_camera(T_world_lidar, run.T_camera_lidar)
     else:
-        rows, numbers = rows_of_same_stamp(poses.stamp_ns, scans.stamp_ns, max_difference_ns=STAMP_TOLERANCE_NS).T
+        rows, numbers = rows_of_same_stamp(poses.stamp_ns, scans.stamp_ns, max_difference_ns=max_difference_ns).T
     if len(rows) == 0:
         raise SegslamError(f"{file}: none of its {len(poses)} poses belongs to a scan of {run.folder}")
     return Trajectory(scans.scan_index[numbers], scans.stamp_ns[numbers], T_world_lidar[rows])

@@ -137,6 +137,33 @@ def test_run_is_scored_against_a_file(tmp_path: Path, capsys: pytest.CaptureFixt
     assert json.loads((made.folder / "metrics.json").read_text())["num_loops_false"] == 1
 
 
+def test_options_of_files_apply_to_the_reference_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = make_run(tmp_path / "run")
+    write_tum(tmp_path / "late.txt", made.truth.stamp_ns + 15_000_000, made.truth.T_world_lidar)
+    late = (made.folder, "--reference", tmp_path / "late.txt")
+    assert _eval(*late) == 2
+    assert "none of its 120 poses belongs to a scan" in capsys.readouterr().err
+    assert _eval(*late, "--max-difference", "0.02", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["num_loops_false"] == 1
+    for more, complaint in (
+        ((*late, "--format", "kitti"), "found 8 numbers; KITTI"),
+        ((made.folder, "--format", "kitti"), "only for poses of a file; give one with --reference"),
+        ((made.folder, "--max-difference", "0.02"), "only for poses of a file; give one with --reference"),
+        ((made.folder, "--up=-y"), "the poses of a run have z up; omit the option"),
+    ):
+        assert _eval(*more) == 2
+        printed = capsys.readouterr()
+        assert complaint in printed.err
+        assert printed.out == ""
+
+
+@pytest.mark.parametrize("value", ["inf", "nan", "-1", "1e300"])
+def test_time_differences_beyond_all_clocks_are_wrong_usage(tmp_path: Path, value: str) -> None:
+    _write_pair(tmp_path)
+    tum = ("--estimate", tmp_path / "estimate_tum.txt", "--reference", tmp_path / "truth_tum.txt")
+    assert _eval(*tum, "--max-difference", value) == 2
+
+
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [

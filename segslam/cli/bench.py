@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -222,7 +222,11 @@ def _read_lists(
     if options.pairs and cuts:
         raise SegslamError("--pairs, --min-m: give lists of pairs, or make one with --min-m and --max-m, not both")
     if options.pairs:
-        lists = [read_pairs(file) for file in options.pairs]
+        files = list(dict.fromkeys(options.pairs))
+        lists = [read_pairs(file) for file in files]
+        names = [one.name for one in lists]  # equal ones are of files in other folders
+        shown = [name if names.count(name) == 1 else str(file) for name, file in zip(names, files, strict=True)]
+        lists = [replace(one, name=name) for one, name in zip(lists, shown, strict=True)]
     elif cuts:
         if reference is None:
             raise SegslamError("--min-m: the data has no true poses; give lists with --pairs FILE")

@@ -74,6 +74,20 @@ def test_a_list_can_be_cut_from_the_true_poses_and_sampled(data: Path, capsys: p
     assert json.loads(capsys.readouterr().out)["segregator"]["num_pairs"] == 2
 
 
+def test_lists_of_one_name_in_two_folders_are_two_rows(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "pairs.txt").write_text("0 57\n3 55\n")
+    options = ("--pairs", tmp_path / "pairs.txt", "--method", "segator", "--labels", "true_labels", "--json")
+    again = ("--pairs", data / "pairs.txt")  # a list that is named twice is one list
+    assert run("bench", "pairs", data, "--pairs", data / "pairs.txt", *options, *again) == 0
+    figures = json.loads(capsys.readouterr().out)["segator"]
+    assert [(row["list"], row["num_pairs"]) for row in figures["by"]] == [
+        (str(data / "pairs.txt"), 3),
+        (str(tmp_path / "pairs.txt"), 2),
+    ]
+
+
 def test_the_report_has_figures_paper_and_conditions_and_draws_failures(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -85,6 +85,11 @@ def test_the_truth_of_a_pair_is_the_pose_of_the_source_in_the_target() -> None:
     np.testing.assert_allclose(geometry.apply(reference.T_world_lidar[65] @ T, point_of_source), in_world)
 
 
+def _posed(matrix: np.ndarray) -> str:
+    """A list of one pair with this pose."""
+    return json.dumps([{"source": 1, "target": 2, "T_target_source": matrix.tolist()}])
+
+
 def test_lists_are_read_with_comments_and_json_brings_its_own_truth(tmp_path: Path) -> None:
     (tmp_path / "some.txt").write_text("# source target\n1 60\n\n2 61 0.5\n")
     assert read_pairs(tmp_path / "some.txt").pairs.tolist() == [[1, 60], [2, 61]]
@@ -102,6 +107,11 @@ def test_lists_are_read_with_comments_and_json_brings_its_own_truth(tmp_path: Pa
         ("a.json", "{}", "contains no pairs"),
         ("a.json", "[1", "a.json"),
         ("a.json", '[{"source": 1, "target": 2}]', "T_target_source"),
+        ("a.json", _posed(np.diag([2.0, 1, 1, 1])), "a.json: .* is not a rigid transform"),
+        ("a.json", _posed(np.diag([-1.0, 1, 1, 1])), "is not a rigid transform"),
+        ("a.json", _posed(geometry.transform(np.eye(3), [np.nan, 0.0, 0.0])), "is not a rigid transform"),
+        ("a.json", _posed(np.full((4, 4), np.inf)), "is not a rigid transform"),
+        ("a.json", _posed(np.ones((4, 4))), "is not a rigid transform"),
     ],
 )
 def test_a_broken_list_is_named_with_the_line(tmp_path: Path, name: str, text: str, expected: str) -> None:

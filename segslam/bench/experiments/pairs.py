@@ -9,11 +9,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.trajectory import rows_of_same_scan
+from segslam.core.errors import brief
+from segslam.core.trajectory import ROTATION_TOLERANCE, rows_of_same_scan
 from segslam.core.types import IndexPairs, Label, Labels, Points, SegslamError, Trajectory, Transform
 from segslam.core.whole_files import read_text
 
@@ -110,18 +112,23 @@ def _from_text(file: Path, text: str) -> PairList:
 
 def _from_json(file: Path, text: str) -> PairList:
     try:
-        truth = {
-            (int(row["source"]), int(row["target"])): geometry.nearest_transform(
-                np.array(row["T_target_source"], dtype=float).reshape(4, 4)
-            )
-            for row in json.loads(text)
-        }
+        truth = {(int(row["source"]), int(row["target"])): _rigid(row["T_target_source"]) for row in json.loads(text)}
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise SegslamError(
             f"{file}: expected a list of objects with source, target and T_target_source (4x4): {error}"
         ) from error
     pairs = np.array(list(truth), dtype=int).reshape(-1, 2)
     return PairList(file.stem, pairs, len(pairs), truth)
+
+
+def _rigid(values: Any) -> Transform:
+    """The transform of 16 numbers by rows. Raises ValueError unless they are one."""
+    matrix = np.array(values, dtype=float).reshape(4, 4)
+    if np.isfinite(matrix).all():
+        T_target_source = geometry.nearest_transform(matrix)
+        if np.abs(matrix - T_target_source).max() <= ROTATION_TOLERANCE:
+            return T_target_source
+    raise ValueError(f"{brief(str(values))} is not a rigid transform")
 
 
 @dataclass(frozen=True, slots=True)

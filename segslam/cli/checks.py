@@ -85,15 +85,15 @@ def make_folder(
     It is removed with the first step of the new one, or at the end of the command, which puts it back if nothing was
     made instead.
 
-    Raises SegslamError for a folder that is no run (it has none of the files `made_by`), for a run in progress, and if
-    the new run is made from files in it.
+    Raises SegslamError for a folder that is no run (no name matches `made_by`), for a run in progress, and if the new
+    run is made from files in it.
     """
     from segslam.output.folder import new_folder
     from segslam.output.log import is_being_written
 
     if not overwrite or not folder.is_dir() or not any(folder.iterdir()):
         return new_folder(folder)
-    logs = [folder / name for name in made_by if (folder / name).exists()]
+    logs = [file for name in made_by for file in folder.glob(name)]
     if not logs or folder.is_symlink():
         raise SegslamError(f"{folder}: not made by this command, so --overwrite does not remove it; give another --out")
     for path in inputs:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.checks import check_not_read, check_own, check_scans
+from segslam.cli.checks import check_not_read, check_own, check_scans, make_folder
 from segslam.cli.console import Terminal
 from segslam.cli.options import EncodingOption, LabelsOption, Numbering, OverwriteOption, ScanOptions, Settings
 from segslam.core.errors import BadScan, SegslamError
@@ -43,7 +43,6 @@ def label(
     check_not_read(out, [data, truth, data / labels])
     terminal.announce(f"label: opening {data}")
     from segslam.bench.labelling import Tally
-    from segslam.output.folder import new_folder
 
     angle_deg = changes.load().sensor.vertical_angle_deg
 
@@ -58,14 +57,14 @@ def label(
         except SegslamError as error:
             text = str(error).replace("--labels", "--truth", 1).replace("--encoding", "--truth-encoding")
             raise SegslamError(text) from error
-    folder = out if overwrite and out.is_dir() else new_folder(out)
+    folder = make_folder(out.resolve(), overwrite=overwrite, made_by=("*.label",))
     tally = Tally(scans, true_scans, folder, write_as=write_as, num_pictures=pictures)
     for row in terminal.progress(range(len(scans)), len(scans), "label"):
         tally.add(row)
     if not tally.seconds:
         raise SegslamError(f"{data}: none of the {len(scans)} scans could be labelled; see the warnings above")
     figures = tally.figures()
-    terminal.table(figures, _table(figures, folder))
+    terminal.table(figures, _table(figures, out))
 
 
 def _table(figures: dict[str, Any], folder: Path) -> str:

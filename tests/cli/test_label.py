@@ -168,6 +168,21 @@ def test_labels_that_are_named_as_their_source_are_written_again(
     assert (tmp_path / "geometric" / "000000.label").read_bytes() != b"earlier"
 
 
+def test_replaced_labels_leave_no_file_of_earlier_scans(drive: Path, tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    out = tmp_path / "out"
+    out.symlink_to("disk")
+    options = ("--out", out, "--labels", "geometric", "--quiet")
+    assert run("label", drive, *options, "--pictures", 3, "--truth", "true_labels") == 0
+    assert len(list(out.iterdir())) == 2 * NUM_SCANS + 1
+    assert run("label", drive, *options, "--overwrite", "--frames", "1:2") == 0
+    assert sorted(file.name for file in out.iterdir()) == ["000001.label", "000001.png"]
+    (tmp_path / "kitti").mkdir()
+    (write_kitti_sequence(tmp_path / "kitti", num_scans=1) / "000000.bin").write_bytes(b"broken")
+    assert run("label", tmp_path / "kitti", *options, "--overwrite") == 2  # nothing was labelled instead
+    assert sorted(file.name for file in out.iterdir()) == ["000001.label", "000001.png"]
+
+
 def test_an_unreadable_scan_is_skipped_with_a_warning(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:

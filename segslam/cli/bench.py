@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from segslam.bench.experiments.method_settings import METHOD_NAMES
-from segslam.cli.checks import check_free, check_own
+from segslam.cli.checks import check_free, check_own, make_folder
 from segslam.cli.commands import GroupedCommands
 from segslam.cli.console import Terminal
 from segslam.cli.ending import is_interrupted
@@ -277,6 +277,8 @@ def _experiment(
             "there, or give a list whose scans are all there"
         )
     trials = [trial for one in lists for trial in pair_trials(one, reference, **varied)]
+    if options.out is not None and options.overwrite:
+        make_folder(options.out, overwrite=True, inputs=[data, *(options.pairs or [])], made_by=("asked.json",))
     terminal.compile_kernels()
     rows: list[Row] = []
     kept = f"are kept in {options.out}; the same command continues" if options.out else "are lost; --out keeps them"

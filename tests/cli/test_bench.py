@@ -74,6 +74,23 @@ def test_a_list_can_be_cut_from_the_true_poses_and_sampled(data: Path, capsys: p
     assert json.loads(capsys.readouterr().out)["segregator"]["num_pairs"] == 2
 
 
+def test_a_benchmark_is_replaced_only_if_wanted(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, options = tmp_path / "out", ("--method", "segator", "--labels", "true_labels", "--quiet")
+    call = ("bench", "pairs", data, "--pairs", data / "pairs.txt", *options, "--out", out)
+    assert run(*call) == 0
+    rows = (out / "details.csv").read_text().replace(",segator,True,", ",segator,False,")
+    for more, kept in (((), True), (("--overwrite",), False)):
+        (out / "details.csv").write_text(rows)
+        (out / "failure_01.png").touch()
+        assert run(*call, *more) == 0
+        assert (",segator,False," in (out / "details.csv").read_text()) is kept
+        assert (out / "failure_01.png").exists() is kept
+    (out / "pairs.txt").write_text("3 55\n")
+    assert run("bench", "pairs", data, "--pairs", out / "pairs.txt", *options, "--out", out, "--overwrite") == 2
+    assert "contains the input" in capsys.readouterr().err
+    assert (out / "details.csv").exists()
+
+
 def test_lists_of_one_name_in_two_folders_are_two_rows(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -8,7 +8,7 @@ from segslam.cli.console import Terminal
 from segslam.cli.dry_run import first_usable
 from segslam.cli.options import Settings
 from segslam.core.errors import SegslamError
-from segslam.core.whole_files import check_target, set_aside
+from segslam.core.whole_files import check_target, set_aside, settle
 
 if TYPE_CHECKING:
     from segslam.core.config import Config
@@ -91,6 +91,8 @@ def make_folder(
     from segslam.output.folder import new_folder
     from segslam.output.log import is_being_written
 
+    if not folder.is_dir() or not any(folder.iterdir()):
+        settle(folder)  # puts back what a killed command had set aside
     if not overwrite or not folder.is_dir() or not any(folder.iterdir()):
         return new_folder(folder)
     logs = [file for name in made_by for file in folder.glob(name)]

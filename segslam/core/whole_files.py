@@ -82,7 +82,7 @@ def set_aside(folder: Path) -> None:
     If a command was killed before that, what it had set aside is kept instead: it is what was whole.
     """
     whole = folder.resolve()
-    aside = whole.with_name(f".{whole.name}.replaced")
+    aside = _aside_of(whole)
     if aside.exists():
         shutil.rmtree(whole)
     else:
@@ -90,11 +90,18 @@ def set_aside(folder: Path) -> None:
     _ASIDE[whole] = aside
 
 
+def _aside_of(whole: Path) -> Path:
+    return whole.with_name(f".{whole.name}.replaced")
+
+
 def settle(folder: Path | None = None) -> None:
-    """Remove what was set aside for a folder, by default for all; where nothing was made instead, put it back."""
+    """Remove what was set aside for a folder, also by a killed command; where nothing was made instead, put it back.
+
+    By default for all folders of this process.
+    """
     for whole in [*_ASIDE] if folder is None else [folder.resolve()]:
-        aside = _ASIDE.pop(whole, None)
-        if aside is None:
+        aside = _ASIDE.pop(whole, _aside_of(whole))
+        if not aside.exists():
             continue
         with suppress(OSError):
             whole.rmdir()  # if it is empty

@@ -11,6 +11,7 @@ from helpers.finished_run import make_run
 
 from segslam.cli.checks import make_folder
 from segslam.core.errors import SegslamError
+from segslam.core.whole_files import settle
 from segslam.output.log import is_being_written, read_log
 from segslam.output.log.writer import Output
 
@@ -130,6 +131,23 @@ def test_a_folder_with_other_content_is_not_written_into(
     assert run(*(paths.get(word, word) for word in command), "--quiet") == 2
     assert "photos: not empty, and not made by this command; give another folder" in capsys.readouterr().err
     assert [file.name for file in (tmp_path / "photos").iterdir()] == ["report.html"]
+
+
+@pytest.mark.parametrize("is_made", [False, True])
+def test_a_run_that_a_killed_command_set_aside_is_back_at_the_next_start(tmp_path: Path, is_made: bool) -> None:
+    out = make_run(tmp_path / "run").folder
+    for overwrite in (True, False):
+        out.rename(tmp_path / ".run.replaced")
+        if is_made:
+            out.mkdir()
+        if overwrite:
+            assert list(make_folder(out, overwrite=True).iterdir()) == []
+            settle()  # nothing was made instead
+        else:
+            with pytest.raises(SegslamError, match="run: not empty"):
+                make_folder(out, overwrite=False)
+        assert [file.name for file in tmp_path.iterdir()] == ["run"]
+        assert (out / "log.mcap").exists()
 
 
 def test_a_run_is_not_lost_if_the_new_one_maps_nothing(

@@ -43,6 +43,15 @@ def test_what_a_killed_command_set_aside_is_put_back(tmp_path: Path) -> None:
     assert (folder / "log.mcap").read_text() == "whole"
 
 
+def test_what_a_killed_command_set_aside_is_removed_when_the_new_run_has_a_step(tmp_path: Path) -> None:
+    for name in ("run", ".run.replaced"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "log.mcap").write_text(name)
+    settle(tmp_path / "run")
+    assert [file.name for file in tmp_path.iterdir()] == ["run"]
+    assert (tmp_path / "run" / "log.mcap").read_text() == "run"
+
+
 @pytest.fixture
 def graph(tmp_path: Path) -> Path:
     import numpy as np

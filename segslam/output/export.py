@@ -14,7 +14,7 @@ import numpy as np
 
 from segslam.core.config import MapConfig, load_config
 from segslam.core.types import GraphEstimate, Indices, Keyframe, Mask, SegslamError, Trajectory, Transform
-from segslam.core.whole_files import cannot_write, whole_file
+from segslam.core.whole_files import cannot_write, expanded, whole_file
 from segslam.output.finished import read_corrections
 from segslam.output.folder import PLACE_ON_GLOBE, read_localised
 from segslam.output.log import RunLog, read_log
@@ -44,10 +44,10 @@ def export(
     georeferenced run .tif, .geojson, .kml, .gpx and map_projector_info.yaml; all are written, or none.
     `settings`: changes such as `"map.color=height"`. Raises SegslamError, naming the file and the remedy.
     """
-    log = read_log(Path(run))
+    log = read_log(expanded(run))
     config = load_config(None, settings, base=log.config).map
     several = [files] if isinstance(files, str | Path) else files
-    return write_maps(log, [Path(file) for file in several], config=config)
+    return write_maps(log, [expanded(file) for file in several], config=config)
 
 
 def write_maps(

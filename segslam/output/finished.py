@@ -12,6 +12,7 @@ from segslam.core.config import Config
 from segslam.core.errors import unreadable
 from segslam.core.trajectory import PoseFormat, lidar_from_camera, read_poses, rows_of_same_stamp
 from segslam.core.types import LoopAttempt, Motion, SegslamError, Trajectory, Transform
+from segslam.core.whole_files import expanded
 from segslam.output.folder import ALONE, folder_of, read_alone, read_localised
 from segslam.output.log import RunLog, read_log
 from segslam.output.words import FIGURES
@@ -57,7 +58,7 @@ class FinishedRun:
 
 def read_run(folder: str | Path) -> FinishedRun:
     """The run of a folder, or of its log. Raises SegslamError if there is none, or it did not finish."""
-    folder = folder_of(Path(folder))
+    folder = folder_of(expanded(folder))
     if not folder.is_dir():
         what = "not a run" if folder.exists() else "no such file or folder"
         raise SegslamError(f"{folder}: {what}; give a folder made by `segslam map --out`")

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from segslam.core.trajectory import Poses, corrected_poses, read_poses, write_tum
 from segslam.core.types import SegslamError
-from segslam.core.whole_files import whole_file, write_whole
+from segslam.core.whole_files import expanded, whole_file, write_whole
 from segslam.gnss import Drive, Fixes, Georeference, Origin, Use, geodetic_from_enu, utm_epsg
 from segslam.gnss import georeference as georeference_drive
 from segslam.gnss.fixes import DUPLICATE, NO_FIX, NOT_FINITE, Row, make_fixes
@@ -118,7 +118,7 @@ def take_over(run: str | Path, map_run: str | Path) -> bool:
 
     Each scan keeps its pose relative to the nearest keyframe of the map, so that it moves as the map was bent.
     """
-    source = folder_of(Path(map_run))
+    source = folder_of(expanded(map_run))
     globe = read_globe(source)
     if globe is None:
         return False

@@ -23,6 +23,7 @@ from segslam.core.types import (
     as_labels,
     as_points,
 )
+from segslam.core.whole_files import expanded
 from segslam.graph import PoseGraph
 from segslam.keyframes import Submaps, downsample_keyframe
 from segslam.labels import geometric_labels
@@ -77,7 +78,7 @@ class Locator:
     @classmethod
     def from_run(cls, folder: str | Path) -> "Locator":
         """The locator of a run folder. Raises SegslamError, naming the file, if it is damaged or did not finish."""
-        return cls(read_session(Path(folder)))
+        return cls(read_session(expanded(folder)))
 
     def locate(
         self, points: ArrayLike, labels: ArrayLike | None = None, *, max_places: int = MAX_PLACES

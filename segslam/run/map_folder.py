@@ -12,6 +12,7 @@ import numpy as np
 from segslam.core.config import Config, OdometryConfig, check_config
 from segslam.core.trajectory import read_poses
 from segslam.core.types import BadScan, SegslamError, Step, Trajectory
+from segslam.core.whole_files import expanded
 from segslam.labels.encodings import Encoding
 from segslam.labels.label_files import unlabelled, whole_source
 from segslam.odometry.kiss import KissOdometry
@@ -52,10 +53,10 @@ def map_folder(
     naming the file and the remedy, also if no scan remains.
     """
     check_config(config)
-    source = DataSource(Path(data), sequence, dataset, labels, encoding, frames, topic)
+    source = DataSource(expanded(data), sequence, dataset, labels, encoding, frames, topic)
     scans = open_scans(source, config or Config())
     config = in_effect(config or preset(preset_for(extent_m(scans))), scans.vertical_angle_deg)
-    folder = new_folder(Path(out))
+    folder = new_folder(expanded(out))
     maker = None if slam_of is Slam or "in_map" in options else slam_of
     own = {"odometry": odometry, "slam_of": maker, "place": place}
     not_resumed = [name for name, value in own.items() if value is not None]
@@ -89,7 +90,7 @@ def resume_options(
 ) -> dict[str, str]:
     """The options that `segslam resume` reads from the log of a run."""
     return {
-        "data": str(Path(source.data).expanduser().resolve()),
+        "data": str(expanded(source.data).resolve()),
         "dataset": source.dataset or "",
         "sequence": source.sequence,
         "frames": source.frames or "",

@@ -12,6 +12,7 @@ from segslam.candidates.proximity import GAP_M
 from segslam.core.config import Config, ProximityConfig, changed_settings, load_config
 from segslam.core.trajectory import travelled_m
 from segslam.core.types import SegslamError, Vector
+from segslam.core.whole_files import expanded
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import copy_alone, new_folder
 from segslam.output.georeferenced import FILE, read_globe
@@ -32,10 +33,10 @@ def replay(
     `run`: its folder or log.mcap. `settings`: changes such as `"verify.max_false_share=0.01"`; `edits` forbids and adds
     loops. Raises SegslamError for a setting that cannot be changed, and for a run localised in the map of another.
     """
-    replayed = Replay.of(Path(run), settings=settings, edits=edits)
+    replayed = Replay.of(expanded(run), settings=settings, edits=edits)
     if replayed.in_map:
         raise SegslamError(f"{run}: localised in the map of another run; use the command `segslam replay`")
-    folder = new_folder(Path(out))
+    folder = new_folder(expanded(out))
     with replayed.begun(folder) as made:
         copy_alone(replayed.recorded.path.parent, folder)
         for _ in made.repeat(replayed.recorded.steps()):

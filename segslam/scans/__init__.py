@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from segslam.core.whole_files import expanded
 from segslam.labels.encodings import Encoding
 from segslam.scans.dataset import Dataset, DataSource
 
@@ -31,5 +32,5 @@ def open_dataset(
     remedy.
     """
     return DataSource(
-        Path(data), sequence, dataset, labels, encoding, frames, topic, intensities, vertical_angle_deg
+        expanded(data), sequence, dataset, labels, encoding, frames, topic, intensities, vertical_angle_deg
     ).open()

@@ -8,7 +8,7 @@ from typing import Any
 import matplotlib
 
 from segslam.core.processes import in_parts
-from segslam.core.whole_files import write_whole
+from segslam.core.whole_files import expanded, write_whole
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.log import read_log
 from segslam.output.map.before_after import BeforeAfter
@@ -30,7 +30,7 @@ def write_report(folder: str | Path) -> Path:
 
     Raises SegslamError if the folder contains no finished run, or cannot be written.
     """
-    folder = Path(folder)
+    folder = expanded(folder)
     run = read_run(folder)
     log = read_log(folder)
     drawings: list[Callable[[FinishedRun], Any]] = [_plots, _pictures]

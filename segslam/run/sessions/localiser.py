@@ -12,6 +12,7 @@ from segslam.core.config import Config
 from segslam.core.threads import Stopwatch
 from segslam.core.trajectory import nearest_rows, travelled_m
 from segslam.core.types import REJECTED_WEIGHT, GraphEstimate, LoopAttempt, Placement, Rejected, Step, Vector
+from segslam.core.whole_files import expanded
 from segslam.graph import AnchoredGraph, Graph
 from segslam.odometry.sweep import Odometry
 from segslam.output.finished import FinishedRun
@@ -92,7 +93,7 @@ def localise(run: str | Path, data: str | Path, out: str | Path, **options: Any)
     of the finished run. Options are those of `map_folder`. Raises SegslamError as `map_folder`, and if the run did not
     finish or is damaged.
     """
-    in_map = {"in_map": str(Path(run).expanduser().resolve())}
+    in_map = {"in_map": str(expanded(run).resolve())}
     made = map_folder(data, out, slam_of=localiser_in(run), options=in_map, **options)
     take_over(made.folder, run)
     return made

@@ -14,6 +14,7 @@ from segslam.candidates.proximity import BREAK_STEP_M
 from segslam.core import geometry
 from segslam.core.config import Config, check_config
 from segslam.core.types import LoopAttempt, SegslamError, Step, Trajectory
+from segslam.core.whole_files import expanded
 from segslam.gnss import Use
 from segslam.gnss.fixes import Row
 from segslam.output.finished import FinishedRun, read_run
@@ -178,10 +179,10 @@ def merge(
     run, if one did not finish, is damaged, is given twice or was not found in any other.
     """
     check_config(config)
-    sessions = read_sessions([Path(run) for run in ([runs] if isinstance(runs, str | Path) else runs)])
+    sessions = read_sessions([expanded(run) for run in ([runs] if isinstance(runs, str | Path) else runs)])
     config = config or sessions[0].run.config
     merged = plan(sessions, config=config, same_reference=same_reference)
-    return write_merged(merged, new_folder(Path(out)), config, on_step=on_step)
+    return write_merged(merged, new_folder(expanded(out)), config, on_step=on_step)
 
 
 def write_merged(

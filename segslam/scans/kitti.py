@@ -159,6 +159,8 @@ def _find_sequence(data: Path, sequence: str) -> tuple[Path, Path]:
     """Folder of the sequence, and file of its true poses, which may be missing."""
     if not (data / "sequences").is_dir() and _is_sequence(data):
         folder = data.resolve()
+        if folder.parent.name == "sequences" and sequence.zfill(2) not in ("00", folder.name):
+            raise SegslamError(f"--sequence {sequence}: {data} is another one; omit the option, or give {data}/../..")
         return folder, folder.parent.parent / "poses" / f"{folder.name}.txt"
     name = sequence.zfill(2)
     folder = data / "sequences" / name

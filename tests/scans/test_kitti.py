@@ -301,6 +301,16 @@ def test_unknown_sequence_names_those_there_are(tmp_path: Path) -> None:
         _open(tmp_path, sequence="7")
 
 
+def test_a_sequence_folder_that_is_not_the_sequence_asked_for_is_refused(tmp_path: Path) -> None:
+    folder = _write_sequence(tmp_path, [0])
+    assert len(_open(folder)) == 1
+    assert len(_open(folder, sequence="00")) == 1  # the default
+    with pytest.raises(SegslamError, match=r"--sequence 7: .*03 is another one; omit the option"):
+        _open(folder, sequence="7")
+    named = folder.rename(tmp_path / "drive")  # which has no number that could contradict
+    assert len(_open(named, sequence="7")) == 1
+
+
 def test_too_few_times_are_refused_with_both_numbers(tmp_path: Path) -> None:
     folder = _write_sequence(tmp_path, [0, 4])
     (folder / "times.txt").write_text("0.0\n0.1\n")

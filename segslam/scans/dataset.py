@@ -246,17 +246,23 @@ def selected_rows(scan_index: Indices, frames: str | None, source: Path) -> Indi
 
 
 def read_stamps(file: Path) -> Indices:
-    """Times (ns) from a file with one time in seconds per line. Raises SegslamError, naming file and line."""
-    lines = read_text(file, "scan times", "expected one time in seconds per line").split()
+    """Times (ns) from a file with one time in seconds per line; empty lines are ignored.
+
+    Raises SegslamError, naming file and line.
+    """
+    text = read_text(file, "scan times", "expected one time in seconds per line")
+    lines = [(number, line) for number, line in enumerate(map(str.strip, text.split("\n")), start=1) if line]
     stamps: list[int] = []
-    for number, line in enumerate(lines, start=1):
+    for number, line in lines:
         try:
             stamp_ns = nanoseconds(line)
         except ValueError as error:
             raise SegslamError(f"{file}:{number}: {error}; correct the line") from error
         if stamp_ns < 0 or (stamps and stamp_ns <= stamps[-1]):
             wrong = (
-                "is negative" if stamp_ns < 0 else f"is not later than the previous line, {brief(lines[number - 2])}"
+                "is negative"
+                if stamp_ns < 0
+                else f"is not later than the previous line, {brief(lines[len(stamps) - 1][1])}"
             )
             raise SegslamError(f"{file}:{number}: {brief(line)} {wrong}; times must ascend and not be negative")
         stamps.append(stamp_ns)

@@ -208,6 +208,20 @@ def test_times_that_do_not_ascend_are_rejected_with_their_line(tmp_path: Path, t
         read_stamps(tmp_path / "times.txt")
 
 
+def test_lines_of_times_are_counted_with_the_empty_ones(tmp_path: Path) -> None:
+    file = tmp_path / "times.txt"
+    for text, complaint in (
+        ("0\n\n  \n0.1\nx\n", r"times\.txt:5: x is not a time"),
+        ("\n\n0.1\r\n\n0.1\r\n", r"times\.txt:5: 0\.1 is not later than the previous line, 0\.1;"),
+        ("0 0.1\n", r"times\.txt:1: 0 0\.1 is not a time"),
+    ):
+        file.write_text(text)
+        with pytest.raises(SegslamError, match=complaint):
+            read_stamps(file)
+    file.write_text("\n0\n\n 0.1 \n")
+    assert read_stamps(file).tolist() == [0, 100_000_000]
+
+
 def test_frames_that_the_data_does_not_have_are_reported(caplog: pytest.LogCaptureFixture) -> None:
     for frames, expected in (("-1:3", "write A:B"), ("3:1", "selects no scan"), ("9:12", "has no such scan")):
         with pytest.raises(SegslamError, match=expected):

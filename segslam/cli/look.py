@@ -22,6 +22,8 @@ SHOWN = (
     *("num_motions_repaired", "num_motions_broken", "ate_m", "odometry_ate_m", "kiss_icp_ate_m", "map_thickness_m"),
 )
 """Figures of the run that are shown, if known."""
+NOT_RESUMED = ("live", "sessions", "python")
+"""Options in the logs of runs that `segslam resume` refuses: live, merged, or made from Python with own odometry."""
 
 
 def info(run: LogArgument, *, terminal: Terminal) -> None:
@@ -110,7 +112,7 @@ def _lines(found: dict[str, Any]) -> str:
 
     num_steps = counted(found["num_steps"], "scan")
     is_replay = "num_scans_left" in found["figures"] and "data" not in found["options"]
-    is_resumable = found["state"] == "interrupted" and not is_replay
+    is_resumable = found["state"] == "interrupted" and not is_replay and found["options"].keys().isdisjoint(NOT_RESUMED)
     then = f"; continue with: segslam resume {shlex.quote(found['run'])}" if is_resumable else ""
     text = [f"{found['run']}: {found['data']}, {found['state']}, {num_steps} in the log{then}"]
     text += with_meanings([found["figures"]], {key: FIGURES[key] for key in found["figures"]}).splitlines()

@@ -11,8 +11,9 @@ from helpers.drives import write_kitti_sequence
 from helpers.finished_run import make_run
 
 from segslam.cli.checks import is_finished
+from segslam.core.config import Config
 from segslam.core.types import BadScan, Scan
-from segslam.output.log import read_log
+from segslam.output.log import LogWriter, read_log
 from segslam.scans import Dataset
 
 pytestmark = pytest.mark.usefixtures("short_runs")
@@ -129,3 +130,22 @@ def test_a_run_is_finished_though_its_last_scan_cannot_be_read(tmp_path: Path) -
     assert whole.read == [], "a recording would be read to its end"
     assert is_finished(recorded, cut)
     assert not is_finished(recorded, longer)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"live": "folder"}, {"sessions": "[1]"}, {"data": "scans", "python": "odometry"}, {"data": "scans", "python": ""}],
+)
+def test_info_suggests_only_what_resume_accepts(
+    options: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scans").mkdir()
+    LogWriter(tmp_path / "log.mcap", config=Config(), dataset="generic/scans", options=options).close()
+    assert run("info", tmp_path) == 0
+    shown = capsys.readouterr().out
+    assert "interrupted" in shown
+    assert run("resume", tmp_path) == 2
+    is_tried = "found neither" in capsys.readouterr().err
+    assert is_tried is (options.get("python") == "")
+    assert ("segslam resume" in shown) is is_tried

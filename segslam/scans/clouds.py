@@ -1,6 +1,7 @@
 """Single scans from files: .bin, .npy, .ply, .pcd. All commands read them here."""
 
 import math
+from codecs import BOM_UTF8
 from io import BytesIO
 from pathlib import Path
 
@@ -31,9 +32,9 @@ def read_file(file: Path) -> Cloud:
             case ".npy":
                 return _from_rows(_parse_npy(read_bytes(file)))
             case ".ply":
-                return from_columns(parse_ply(read_bytes(file)))
+                return from_columns(parse_ply(read_bytes(file).removeprefix(BOM_UTF8)))
             case ".pcd":
-                return from_columns(parse_pcd(read_bytes(file)))
+                return from_columns(parse_pcd(read_bytes(file).removeprefix(BOM_UTF8)))
             case other:
                 raise SegslamError(f"{file}: unknown format {other or '(no extension)'}; give .bin, .npy, .ply or .pcd")
     except (ValueError, MemoryError) as error:
@@ -56,6 +57,10 @@ def _parse_npy(content: bytes) -> np.ndarray:
         raise ValueError(f"it is not a .npy file, or its header is damaged ({what}); save it by numpy.save") from error
     if len(shape) != 2 or shape[0] < 0 or shape[1] < 3 or kind.kind not in "fiu" or kind.itemsize > 8:
         raise ValueError(f"it contains {brief(f'{kind} of shape {shape}')}; expected (n, 3) numbers, x y z")
+    if shape[0] in (3, 4) and shape[1] > 100:  # no scan has as many values per point
+        raise ValueError(
+            f"its shape {shape} is transposed; expected (n, {shape[0]}), as numpy.save('NAME.npy', array.T)"
+        )
     num_bytes = len(content) - stream.tell()
     if num_bytes != math.prod(shape) * kind.itemsize:
         raise ValueError(f"its header claims {shape} {kind}, but {num_bytes} bytes follow: truncated")

@@ -34,7 +34,7 @@ def parse_pcd(content: bytes) -> Columns:
         raise ValueError(f"its header has the unknown line {unknown[0][:40]!r}")
     fields = _fields(header)
     num_points = _num_points(header)
-    match header["DATA"]:
+    match [word.lower() for word in header["DATA"]]:
         case ["ascii"]:
             return text_columns(content, start, num_points, fields, is_last=True)
         case ["binary"]:

@@ -200,6 +200,8 @@ def _loader(kind: str, source: Path, sequence: str, topic: str) -> Any:
 
 def _kind_of(data: Path) -> str:
     if data.is_file() and (suffix := data.suffix.lower()) in KIND_OF_SUFFIX:
+        if KIND_OF_SUFFIX[suffix] == "rosbag" and data.suffix != suffix:
+            raise SegslamError(f"{data}: the extension of a bag is in small letters; rename it: {data.stem}{suffix}")
         return KIND_OF_SUFFIX[suffix]
     if (data / "metadata.yaml").exists() or any(data.glob("*.bag")):
         return "rosbag"

@@ -1,6 +1,7 @@
 """Scan files in all forms that programs write, read in the same way by every command; and files that are no scans."""
 
 import os
+from codecs import BOM_UTF8
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +94,10 @@ FILES = {
         {"intensity": "F41", "z": "F41", "y": "F41", "x": "F41"}, _rows(i="<f4", z="<f4", y="<f4", x="<f4")
     ),
     "padded to a block.pcd": _pcd(FLOATS, XYZ + bytes(11)),
+    "marked.ply": BOM_UTF8 + _ply("float x, float y, float z", XYZ),
+    "marked.pcd": BOM_UTF8 + _pcd(FLOATS, XYZ),
+    "capitals.PCD": _pcd(FLOATS, XYZ, form="BINARY"),
+    "capitals.PLY": _ply("float x, float y, float z", XYZ),
 }
 
 
@@ -201,6 +206,17 @@ def test_npy_files_are_scans_unless_there_are_others(tmp_path: Path) -> None:
     assert len(open_dataset(tmp_path)[0].points) == 5
     np.ones((10, 4), np.float32).tofile(tmp_path / "1.bin")
     assert [len(scan.points) for scan in open_dataset(tmp_path)] == [10]
+
+
+@pytest.mark.parametrize("num", [3, 4])
+def test_a_transposed_npy_is_refused_with_the_remedy(tmp_path: Path, num: int) -> None:
+    np.save(tmp_path / "0.npy", np.ones((num, 500)))
+    with pytest.raises(
+        BadScan, match=rf"its shape \({num}, 500\) is transposed; .* numpy\.save\('NAME\.npy', array\.T\)"
+    ):
+        read_file(tmp_path / "0.npy")
+    np.save(tmp_path / "0.npy", np.ones((num, 9)))
+    assert len(read_file(tmp_path / "0.npy").points) == num
 
 
 def test_a_point_beyond_all_numbers_is_no_point(tmp_path: Path) -> None:

@@ -44,6 +44,13 @@ def test_a_recording_whose_clock_starts_at_0_is_read_whole(tmp_path: Path, write
     assert stamps == [number * SECOND // 2 for number in range(6)]
 
 
+@pytest.mark.parametrize("suffix", [".BAG", ".DB3"])
+def test_a_bag_whose_extension_is_in_capitals_is_to_be_renamed(tmp_path: Path, suffix: str) -> None:
+    write_bag1(tmp_path / "a.bag", _drive(num=1)).rename(tmp_path / f"a{suffix}")
+    with pytest.raises(SegslamError, match=rf"in small letters; rename it: a\{suffix.lower()}"):
+        open_dataset(tmp_path / f"a{suffix}", topic=TOPIC)
+
+
 def test_an_ouster_clock_that_starts_at_0_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("helpers.ouster_packets.START_NS", 0)
     data = record(tmp_path, "RNG15_RFL8_NIR8_DUAL", [np.full((NUM_COLUMNS, 2), 3000)] * 2)

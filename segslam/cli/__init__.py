@@ -8,6 +8,7 @@ import io
 import logging
 import os
 import sys
+from itertools import pairwise
 from typing import Annotated
 
 import typer
@@ -68,6 +69,9 @@ def _status(arguments: list[str] | None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")  # names of files may be unprintable
     try:
         words = [_with_home(argument) for argument in (sys.argv[1:] if arguments is None else arguments)]
+        for before, word in pairwise(words):
+            if word == "" and (before == "--out" or not before.startswith("-")):  # a path, which stands for this folder
+                raise SegslamError(f"empty text after {before!r}: give a path, `.` for this folder")
         add(app, words)
         app(words, prog_name="segslam")
     except SystemExit as ended:

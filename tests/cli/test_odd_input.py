@@ -97,6 +97,17 @@ def test_a_home_folder_is_expanded_behind_an_option_and_an_unknown_user_is_refus
     assert "~nosuch/x: there is no such user" in capsys.readouterr().err
 
 
+def test_an_empty_path_is_not_the_present_folder(
+    scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for command in (("map", ""), ("map", scans, "--out", ""), ("register", scans / "000000.bin", ""), ("info", "")):
+        assert run(*command) == 2
+        assert f"empty text after '{command[-2]}': give a path, `.` for this folder" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+    assert run("map", scans, "--dry-run", "--topic", "", "-q") == 0  # the default
+
+
 @pytest.mark.slow
 def test_a_run_whose_data_has_an_odd_name_is_resumed(
     scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture

@@ -182,6 +182,8 @@ class GnssOptions:
     gnss_offset: Annotated[float, "Seconds to add to the times of the fixes."] = 0.0
 
     def __post_init__(self) -> None:
+        if self.gnss is None and (self.gnss_use, self.gnss_offset) != ("fuse", 0.0):
+            raise SegslamError("--gnss-use, --gnss-offset: only for position fixes; give them with --gnss")
         if self.gnss is not None and not abs(self.gnss_offset) < MOST_OFFSET_S:
             raise SegslamError(f"--gnss-offset {self.gnss_offset}: not a difference of clocks in seconds")
         if self.gnss is not None and self.gnss_use not in GNSS_USES:

@@ -108,6 +108,14 @@ def test_an_empty_path_is_not_the_present_folder(
     assert run("map", scans, "--dry-run", "--topic", "", "-q") == 0  # the default
 
 
+@pytest.mark.parametrize("option", [("--gnss-use", "align"), ("--gnss-offset", "5"), ("--gnss-offset", "nan")])
+def test_options_of_position_fixes_are_refused_without_fixes(
+    option: tuple[str, str], scans: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("map", scans, "--dry-run", *option) == 2
+    assert "only for position fixes; give them with --gnss" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_a_run_whose_data_has_an_odd_name_is_resumed(
     scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture

@@ -102,13 +102,14 @@ def locate(
     for file in label_files:
         check_exists(file, "--labels: give geometric, none, or a folder with a .label file for each scan")
     terminal.announce(f"locate: reading {run}")
-    from segslam.labels.label_files import LabelSource, computed, encoding_of
+    from segslam.labels.label_files import LabelSource, computed, encoding_of, open_labels
     from segslam.run.locator import Locator
 
     files.check()
-    source = LabelSource(labels == "geometric")
     if label_files:
         source = LabelSource(False, Path(labels), files.encoding or encoding_of(label_files))
+    else:
+        source = open_labels(labels, beside=Path(), scan_names=(), encoding=files.encoding)
     locator = Locator.from_run(run)
     terminal.compile_kernels()
     num_bad = 0
@@ -209,7 +210,7 @@ def _read_two(
 
         sources = [of_file(file) for file in label_files]
     elif _is_word(words[0]):
-        of_both: LabelsOf = open_labels(words[0], beside=source.parent, scan_names=(), encoding=None).read
+        of_both: LabelsOf = open_labels(words[0], beside=source.parent, scan_names=(), encoding=files.encoding).read
         sources = [of_both, of_both]
     else:
         raise SegslamError(

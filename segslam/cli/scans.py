@@ -39,6 +39,8 @@ def label(
 
     Example: segslam label kitti --labels network:model.onnx --frames 0:3 --truth kitti/sequences/00/labels --out labels
     """
+    if truth_encoding is not None and truth is None:
+        raise SegslamError(f"--truth-encoding {truth_encoding}: only true labels have one; give them with --truth")
     check_own(out, "*.label")
     check_not_read(out, [data, truth, data / labels])
     terminal.announce(f"label: opening {data}")

@@ -131,6 +131,7 @@ def test_the_table_has_a_line_for_each_class(drive: Path, tmp_path: Path, capsys
         (("--labels", "geometric", "--truth", "nowhere"), "--truth nowhere: no folder"),
         (("--labels", "network:none.onnx"), "none.onnx: no such file"),
         (("--labels", "geometric", "--frames", "7:9"), "no such scan"),
+        (("--labels", "geometric", "--truth-encoding", "raw"), "only true labels have one; give them with --truth"),
     ],
 )
 def test_bad_usage_is_reported(

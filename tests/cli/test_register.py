@@ -44,6 +44,16 @@ def test_register_prints_the_pose_as_json(
     assert figures["overlap"] > 0.5 if refine else figures["overlap"] is None
 
 
+@pytest.mark.parametrize("labels", ["geometric", "none"])
+def test_a_numbering_is_refused_without_label_files(
+    labels: str, files: dict[str, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("register", files["source"], files["target"], "--labels", labels, "--encoding", "raw") == 2
+    assert f"--encoding raw: only label files have one; omit it with --labels {labels}" in capsys.readouterr().err
+    assert run("locate", "nowhere", files["source"], "--labels", labels, "--encoding", "raw") == 2
+    assert f"--encoding raw: only label files have one; omit it with --labels {labels}" in capsys.readouterr().err
+
+
 def test_a_rejection_has_a_reason_one_line_and_exit_status_1(
     files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -74,6 +74,7 @@ def test_a_list_can_be_cut_from_the_true_poses_and_sampled(data: Path, capsys: p
     assert json.loads(capsys.readouterr().out)["segregator"]["num_pairs"] == 2
 
 
+@pytest.mark.long
 def test_a_benchmark_is_replaced_only_if_wanted(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, options = tmp_path / "out", ("--method", "segator", "--labels", "true_labels", "--quiet")
     call = ("bench", "pairs", data, "--pairs", data / "pairs.txt", *options, "--out", out)

@@ -169,6 +169,7 @@ def test_labels_that_are_named_as_their_source_are_written_again(
     assert (tmp_path / "geometric" / "000000.label").read_bytes() != b"earlier"
 
 
+@pytest.mark.long
 def test_replaced_labels_leave_no_file_of_earlier_scans(drive: Path, tmp_path: Path) -> None:
     (tmp_path / "disk").mkdir()
     out = tmp_path / "out"

@@ -14,6 +14,7 @@ from segslam.core.types import Points, SegslamError, Transform, Vector
 from segslam.gnss.matching import Matched, Prepared
 from segslam.gnss.statistics import Weights, correlated, fix_noise, longest_chain, robust_weights, sigmas
 from segslam.graph.closure_pairs import adjoints
+from segslam.graph.edges import BREAK_DEG
 
 NUM_GUESSES = 400
 """Chosen: pairs of fixes that propose a heading; half of the fixes may be wrong, and 100 good pairs are left."""
@@ -21,8 +22,6 @@ LEAST_FIXES = 4
 """Three parameters of the plane, and one fix more."""
 LEAST_SPAN_M = 1.0
 """Chosen: fixes within this show no heading."""
-MOST_HEADING_DEG = 5.0
-"""Chosen: a placement is refused if the standard deviation of its heading is larger."""
 ROUNDS = 12
 """Chosen: iterations of the refinement; it settles in about six."""
 PRIOR_TILT_DEG, PRIOR_OFFSET_S, PRIOR_ARM_M = 2.0, 1.0, 1.0
@@ -79,11 +78,11 @@ def place(prepared: Prepared, *, offset_s: float = 0.0) -> Placement:
             "the drive"
         )
     placement = refined(matched, _start(matched, source), np.zeros(3))
-    if placement.heading_sigma_deg > MOST_HEADING_DEG:
+    if placement.heading_sigma_deg > BREAK_DEG:
         raise SegslamError(
             f"{source}: the fixes determine the heading of the map to {placement.heading_sigma_deg:.1f} degrees only "
             f"({span_m:.0f} m of drive, errors of {placement.sigma_m[0]:.1f} m): a map is placed if it is known to "
-            f"{MOST_HEADING_DEG:.0f}; use fixes of a longer part of the drive"
+            f"{BREAK_DEG:.0f}; use fixes of a longer part of the drive"
         )
     return placement
 

@@ -23,7 +23,8 @@ Kernel = Any
 """One of gtsam.noiseModel.mEstimator; their common base is not in GTSAM's stubs."""
 Transforms = Float[np.ndarray, "_ 4 4"]
 BREAK_M, BREAK_DEG = 1.0, 5.0
-"""A motion with a larger standard deviation is a break. Chosen: 100 m of healthy odometry have a tenth of it."""
+"""A motion with a larger standard deviation is a break. Chosen: 100 m of healthy odometry have a tenth of it.
+A drive whose heading is as unsure is not placed by position fixes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

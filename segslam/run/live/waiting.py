@@ -12,6 +12,7 @@ from time import monotonic
 import numpy as np
 
 from segslam.core.types import BadScan, Scan, Transform
+from segslam.odometry.motion_model import LONG_GAP
 from segslam.scans.dataset import Cloud, make_scan, times_of
 
 MOST_WAITING = 4
@@ -20,10 +21,6 @@ END_NS = 2**62
 """Stamps are below this one, in the year 2116: 64 bits hold them also if they are shifted."""
 WAKE_S = 0.2
 """Longest time until a stop takes effect."""
-LONG_GAP = 1.5
-"""Chosen: there is a gap if stamps are farther apart than this many usual intervals."""
-LONGEST_PREDICTED = 10.0
-"""Chosen: after more intervals (1 s at 10 Hz), prediction with constant velocity is useless."""
 SET_BACK_NS = 1_000_000_000
 """Chosen: the sender's clock was set back if a stamp is this much earlier than the last, as in a replay."""
 SET_FORWARD_NS = 24 * 3600 * 1_000_000_000
@@ -154,7 +151,7 @@ class Rhythm:
         if usual_ns == 0:
             return 1.0
         gap = (to_ns - from_ns) / usual_ns
-        return 1.0 if gap < LONG_GAP else min(gap, LONGEST_PREDICTED)
+        return 1.0 if gap < LONG_GAP else gap
 
     def _usual_ns(self) -> int:
         return int(median(self._intervals_ns)) if self._intervals_ns else 0

@@ -88,7 +88,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def interrupt_after(num_scans: int, monkeypatch: pytest.MonkeyPatch, *, command: str = "map") -> None:
-    """Ctrl-C is pressed when the bar of the command has come so far."""
+    """Ctrl-C is pressed when the bar of the command has come so far; the run is not ahead of the bar."""
 
     def interrupted(_: Terminal, items: Iterable[Any], total: int, title: str) -> Iterator[Any]:
         for number, item in enumerate(items):
@@ -97,6 +97,7 @@ def interrupt_after(num_scans: int, monkeypatch: pytest.MonkeyPatch, *, command:
             yield item
 
     monkeypatch.setattr(Terminal, "progress", interrupted)
+    monkeypatch.setattr("segslam.run.run.MOST_WAITING", 0)
 
 
 def test_an_interrupted_run_continues_with_the_printed_command(

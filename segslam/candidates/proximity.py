@@ -27,11 +27,6 @@ MAX_CANDIDATES = 2
 GAP_M = 2.0 * SAME_PLACE_M
 """Chosen: travel between two loops, and between two candidates of a keyframe: every second place."""
 
-BREAK_STEP_M = 1e5
-"""Travel assigned to a break, because the relative pose across it is unknown."""
-BREAK_TRAVEL_M = BREAK_STEP_M / 2.0
-"""Keyframes this far apart in travel are separated by a break of the odometry, however the step was rounded."""
-
 Covariances = Callable[[int, Indices], Float[np.ndarray, "_ 6 6"]]
 """Covariance of the pose of a keyframe in each of others, as a tangent of the keyframe (`graph.covariances`)."""
 

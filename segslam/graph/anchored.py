@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from segslam.candidates.proximity import BREAK_STEP_M
 from segslam.core.config import GraphConfig
 from segslam.core.trajectory import Poses
 from segslam.core.types import (
@@ -49,8 +48,13 @@ class AnchoredGraph:
 
     @property
     def travel_m(self) -> Vector:
-        """(n,) travel of each keyframe, by id."""
-        return self._graph.travel_m[1:] - BREAK_STEP_M
+        """As that of `PoseGraph`; before the first keyframe is a break."""
+        return self._graph.travel_m[1:]
+
+    @property
+    def num_breaks(self) -> Indices:
+        """As that of `PoseGraph`, 1 or more."""
+        return self._graph.num_breaks[1:]
 
     @property
     def motion_variance(self) -> Vector:
@@ -79,8 +83,7 @@ class AnchoredGraph:
         """As `PoseGraph.add_keyframe`."""
         if keyframe_id == 0:
             information = np.zeros((6, 6))
-        at_m = travel_m + BREAK_STEP_M
-        self._graph.add_keyframe(keyframe_id + 1, T_odom_keyframe, at_m, information=information, stamp_ns=stamp_ns)
+        self._graph.add_keyframe(keyframe_id + 1, T_odom_keyframe, travel_m, information=information, stamp_ns=stamp_ns)
 
     def add_closure(self, closure: LoopClosure) -> Any:
         """Raises SegslamError: a localised drive has no loops of its own."""

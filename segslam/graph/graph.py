@@ -58,6 +58,8 @@ fewer iterations."""
 CLOSURES_PER_WAITING = 200
 """Chosen: the graph is optimised after 1 + n / 200 new closures, with n closures in the estimate, so that the time of
 all optimisations grows linearly with the drive. The KITTI drives tried have 86 closures at most."""
+BREAK_LENGTH_M = 1e5
+"""Travel that stands for a break, longer than any drive: keyframes across it are near each other along no path."""
 
 
 class PoseGraph:
@@ -95,7 +97,9 @@ class PoseGraph:
         self._finished = gtsam.Values()
         """Poses before the first adjustment."""
         self._T_odom_last = np.eye(4)
+        self._path_m = Rows(np.empty(0))
         self._travel_m = Rows(np.empty(0))
+        self._num_breaks = Rows(np.empty(0, np.int64))
         self._motion_variance = Rows(np.empty(0))
         self._time_s = Rows(np.empty(0))
 
@@ -106,8 +110,13 @@ class PoseGraph:
 
     @property
     def travel_m(self) -> Vector:
-        """(n,) travel of each keyframe, by id."""
+        """(n,) travel of each keyframe, by id; each break is `BREAK_LENGTH_M` long."""
         return self._travel_m.all()
+
+    @property
+    def num_breaks(self) -> Indices:
+        """(n,) number of breaks before each keyframe, by id."""
+        return self._num_breaks.all()
 
     @property
     def motion_variance(self) -> Vector:
@@ -137,7 +146,7 @@ class PoseGraph:
         information: Information | None = None,
         stamp_ns: int | None = None,
     ) -> None:
-        """Add the next keyframe, with an odometry edge from the one before.
+        """Add the next keyframe, with an odometry edge from the one before. `travel_m`: length of the path to it.
 
         `information` of the motion from the last keyframe (tangent in the new keyframe) replaces the noise model of
         odometry: a repaired motion has the information of its registration, an unknown one almost none. The first
@@ -148,14 +157,14 @@ class PoseGraph:
             expected = f"expected {self.num_keyframes}, got {keyframe_id}"
             raise ValueError(f"keyframe ids count from 0 without gaps: {expected}")
         if keyframe_id == 0:
-            variance = 0.0
+            variance, num_breaks = 0.0, 0
             pose = gtsam.Pose3(geometry.nearest_transform(T_odom_keyframe))
             self._prior.add(gtsam.PriorFactorPose3(0, pose, noise.first_pose()))
             self._backbone.push_back(self._prior)
         else:
             # Rounding in a long chain would stop the solver far from the optimum.
             T_last_new = geometry.nearest_transform(geometry.inverse(self._T_odom_last) @ T_odom_keyframe)
-            way_m = travel_m - self.travel_m[-1]
+            way_m = travel_m - self._path_m.all()[-1]
             known, configured = (
                 noise.motion_information(information)
                 if information is not None
@@ -164,7 +173,8 @@ class PoseGraph:
             )
             edge = Edge(keyframe_id - 1, keyframe_id, T_last_new, known)
             self._has_own_information.append(information is not None)
-            self._has_breaks |= is_break(edge)
+            self._has_breaks |= is_break(edge)  # also where loops show that the odometry errs more
+            num_breaks = self.num_breaks[-1] + (information is not None and is_break(edge))
             self._odometry.append(edge)
             self._rejected.append(False)
             self._backbone.add(edge.factor())
@@ -175,7 +185,9 @@ class PoseGraph:
         if self._chains is not None:
             self._chains.add(pose.matrix(), self._odometry[-1])
         self._T_odom_last = T_odom_keyframe
-        self._travel_m.append(travel_m)
+        self._path_m.append(travel_m)
+        self._travel_m.append(travel_m + BREAK_LENGTH_M * num_breaks)
+        self._num_breaks.append(num_breaks)
         self._motion_variance.append(variance)
         self._time_s.append(np.nan if stamp_ns is None else 1e-9 * stamp_ns)
 
@@ -211,9 +223,10 @@ class PoseGraph:
     def _use_noise_of(self, config: GraphConfig) -> None:
         """Motions that came with an information keep it."""
         self._config = config
+        ways_m = np.diff(self._path_m.all()).tolist()
         self._odometry = [
-            edge if own else replace(edge, information=noise.odometry_information(float(way_m), edge.T_a_b, config))
-            for edge, own, way_m in zip(self._odometry, self._has_own_information, np.diff(self.travel_m), strict=True)
+            edge if own else replace(edge, information=noise.odometry_information(way_m, edge.T_a_b, config))
+            for edge, own, way_m in zip(self._odometry, self._has_own_information, ways_m, strict=True)
         ]
         self._rebuild_backbone()
 
@@ -289,7 +302,7 @@ class PoseGraph:
 
     def _corrects_steady_drift(self) -> bool:
         """Correct a steady drift of the heading, if that explains a drift beyond the tolerated errors."""
-        growth = np.column_stack([np.diff(self.travel_m), np.nan_to_num(np.diff(self._time_s.all()))])
+        growth = np.column_stack([np.diff(self._path_m.all()), np.nan_to_num(np.diff(self._time_s.all()))])
         growth[np.array([self._has_own_information, self._rejected], dtype=bool).any(axis=0)] = 0.0
         raised = self._config
         self._use_noise_of(self._configured)

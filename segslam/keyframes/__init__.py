@@ -34,17 +34,15 @@ class KeyframeSelector:
         self.travel_m = 0.0
         """Length of the path through all scans so far."""
 
-    def update(self, T_odom_lidar: Transform, *, break_m: float = 0.0) -> bool:
-        """True if the next scan becomes a keyframe, as do the first scan and the first after a break (`break_m`).
+    def update(self, T_odom_lidar: Transform, *, after_break: bool = False) -> bool:
+        """True if the next scan becomes a keyframe, as do the first scan and the first after a break.
 
         The distance is the straight one from the last keyframe, so that jitter of a standing sensor adds no keyframes.
         """
-        if break_m:
-            self.travel_m += break_m
-        elif self._T_odom_last is not None:
+        if self._T_odom_last is not None:
             self.travel_m += geometry.distance(geometry.inverse(self._T_odom_last) @ T_odom_lidar)
         self._T_odom_last = T_odom_lidar
-        if self._T_odom_keyframe is not None and not break_m:
+        if self._T_odom_keyframe is not None and not after_break:
             moved = geometry.inverse(self._T_odom_keyframe) @ T_odom_lidar
             if geometry.distance(moved) < self._config.distance_m and geometry.angle(moved) < math.radians(ANGLE_DEG):
                 return False

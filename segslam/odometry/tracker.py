@@ -6,7 +6,6 @@ from functools import partial
 
 import numpy as np
 
-from segslam.candidates.proximity import BREAK_STEP_M
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch
@@ -75,9 +74,14 @@ class Tracker:
         self._num_tracked += 1
         T_odom_lidar = registered.T_odom_lidar
         motion = registered.motion or Motion(MotionState.UNCHECKED)
-        is_keyframe = self._selector.update(T_odom_lidar, break_m=BREAK_STEP_M * motion.is_break)
+        is_keyframe = self._selector.update(T_odom_lidar, after_break=motion.is_break)
         kept = registered if is_keyframe else None
-        return Tracked(index, scan.stamp_ns, kept, T_odom_lidar, self._selector.travel_m, motion, watch)
+        return Tracked(index, scan.stamp_ns, kept, T_odom_lidar, self.travel_m, motion, watch)
+
+    @property
+    def travel_m(self) -> float:
+        """Length of the path through all scans so far."""
+        return self._selector.travel_m
 
     def alone(self) -> Sequence[Transform]:
         """The pose of each tracked scan by KISS-ICP alone; empty if it was not kept, or for another odometry."""
@@ -86,7 +90,7 @@ class Tracker:
     def note(self, recorded: Step) -> None:
         """Note a recorded step; after `resume`, `track` continues from it."""
         motion = recorded.motion or Motion(MotionState.UNCHECKED)
-        self._selector.update(recorded.T_odom_lidar, break_m=BREAK_STEP_M * motion.is_break)
+        self._selector.update(recorded.T_odom_lidar, after_break=motion.is_break)
         self._last_stamp_ns = recorded.stamp_ns
         self._num_tracked = recorded.scan_index + 1
 

@@ -127,7 +127,9 @@ class Slam:
     def repeat(self, recorded: Step) -> Step:
         """As `process`, but from a recorded Step: repeat everything after the selection of the keyframe."""
         self._tracker.note(recorded)
-        keyframe = None if recorded.keyframe is None else replace(recorded.keyframe, place=None)
+        keyframe = None
+        if recorded.keyframe is not None:  # its travel is that of earlier versions otherwise, where breaks were long
+            keyframe = replace(recorded.keyframe, place=None, travel_m=self._tracker.travel_m)
         return self._advance(replace(recorded, keyframe=keyframe), Stopwatch(), self._loops.attempt)
 
     def take(self, recorded: Step, below: int = 0, optimize: bool = False) -> Step:

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from segslam.candidates.proximity import BREAK_STEP_M, BREAK_TRAVEL_M
 from segslam.core import geometry
 from segslam.core.config import Config, KeyframeConfig
 from segslam.core.types import Keyframe, Label
@@ -45,14 +44,12 @@ def test_a_standing_sensor_that_jitters_cuts_no_keyframe() -> None:
     assert selector.travel_m > 10.0, "else the test would not tell distance from path"
 
 
-def test_travel_across_a_break_is_at_least_that_of_a_break_however_it_is_rounded() -> None:
-    for before_m in np.random.default_rng(0).uniform(0.0, 500.0, 50):
-        selector = KeyframeSelector(CONFIG)
-        selector.update(_at(0.0))
-        selector.update(_at(before_m))
-        travel_m = selector.travel_m
-        assert selector.update(_at(before_m), break_m=BREAK_STEP_M)
-        assert selector.travel_m - travel_m >= BREAK_TRAVEL_M
+def test_the_first_scan_after_a_break_is_a_keyframe_and_the_path_has_its_real_length() -> None:
+    selector = KeyframeSelector(CONFIG)
+    selector.update(_at(0.0))
+    assert not selector.update(_at(0.1))
+    assert selector.update(_at(0.3), after_break=True)
+    assert selector.travel_m == pytest.approx(0.3)
 
 
 def test_a_submap_has_the_neighbours_whose_pose_is_known_to_a_voxel() -> None:

@@ -45,7 +45,7 @@ def measured(seconds: float, from_deg: float = 180.0, velocities: Velocities | N
     return measure_sweep(
         lambda keyframe_id: points(keyframe_id, seconds, from_deg),
         T_TRUE,
-        STEP_M * np.arange(NUM),
+        np.zeros(NUM, np.int64),
         velocities or drive(),
         config=CONFIG,
     )
@@ -70,7 +70,14 @@ def test_a_sensor_that_stands_and_a_short_drive_show_no_sweep() -> None:
     assert measured(-0.1, velocities=Velocities(np.zeros((NUM, 6)), INTERVAL_S)) is None
     few = Velocities(drive().per_second[:12], INTERVAL_S)
     raw = [points(number, -0.1) for number in range(12)]
-    assert measure_sweep(raw.__getitem__, T_TRUE[:12], STEP_M * np.arange(12), few, config=CONFIG) is None
+    assert measure_sweep(raw.__getitem__, T_TRUE[:12], np.zeros(12, np.int64), few, config=CONFIG) is None
+
+
+def test_pairs_across_a_break_show_no_sweep() -> None:
+    def unread(keyframe_id: int) -> np.ndarray:
+        raise AssertionError(f"keyframe {keyframe_id} was read")
+
+    assert measure_sweep(unread, T_TRUE, np.arange(NUM), drive(), config=CONFIG) is None
 
 
 @pytest.mark.long
@@ -130,8 +137,6 @@ def test_scans_of_kitti_are_sweeps_of_its_sensor_and_those_of_nclt_are_compensat
     truth = scans.reference
     rows = np.arange(len(truth))
     velocities = velocities_of(truth, rows, [Motion(MotionState.CONFIRMED)] * len(rows))
-    found = measure_sweep(
-        lambda row: scans[row].points, truth.T_world_lidar, 2.0 * rows.astype(float), velocities, config=CONFIG
-    )
+    found = measure_sweep(lambda row: scans[row].points, truth.T_world_lidar, 0 * rows, velocities, config=CONFIG)
     assert (found and found.seconds) == (expected_s and pytest.approx(expected_s, abs=0.004))
     assert found is None or found.from_deg == 180.0

@@ -8,10 +8,10 @@ import pytest
 from helpers.packed_drives import opened
 from helpers.yards import seen
 
-from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core import geometry
 from segslam.core.config import RefineConfig, SensorCalibrationConfig
 from segslam.core.geometry import raise_beams
+from segslam.graph.graph import BREAK_LENGTH_M
 from segslam.registration import refinement
 from segslam.slam.adjustment import vertical_angle
 from segslam.slam.adjustment.alignment import MIN_PAIRS, Shown
@@ -68,7 +68,7 @@ def test_keyframes_farther_apart_than_a_pair_give_no_angle() -> None:
 @pytest.mark.long
 def test_a_drive_with_a_break_shows_the_angle_too() -> None:
     places_m = np.arange(-44.0, 45.0, 2.0)
-    travel_m = places_m + 44.0 + np.where(places_m > 0.0, BREAK_TRAVEL_M, 0.0)
+    travel_m = places_m + 44.0 + np.where(places_m > 0.0, BREAK_LENGTH_M, 0.0)
     found = measure_vertical_angle(
         lambda i: points_at(float(places_m[i])),
         poses_at(places_m),

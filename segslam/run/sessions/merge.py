@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from segslam.candidates.places import OTHER_PLACE_M
-from segslam.candidates.proximity import BREAK_STEP_M
 from segslam.core import geometry
 from segslam.core.config import Config, check_config
 from segslam.core.types import LoopAttempt, SegslamError, Step, Trajectory
@@ -223,7 +222,7 @@ def _placed(sessions: Sequence[Session], session_poses: Sequence[SessionPose | N
             keyframe_id=shift.keyframe_id + len(before.travel_m),
             scan_index=shift.scan_index + int(drive.scan_index[-1]) + 1,
             stamp_ns=0 if first_ns > last_ns else last_ns + GAP_NS - first_ns,
-            travel_m=shift.travel_m + float(before.travel_m[-1]) + BREAK_STEP_M,
+            travel_m=shift.travel_m + float(before.travel_m[-1]),
             T_new_old=T_new_first @ geometry.inverse(session.keyframes[0].T_odom_keyframe),
         )
         yield replace(session, shift=shift, found=found)

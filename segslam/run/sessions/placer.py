@@ -14,7 +14,7 @@ from itertools import islice
 import numpy as np
 
 from segslam.candidates.places import OTHER_PLACE_M, SAME_PLACE_M
-from segslam.candidates.proximity import BREAK_TRAVEL_M, MAX_CANDIDATES
+from segslam.candidates.proximity import MAX_CANDIDATES
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch
@@ -53,7 +53,7 @@ class Placer:
         travel_m = self._graph.travel_m
         why = Rejected(RejectReason.NO_PLACE, "not found yet")
         since_m = np.inf if self._last is None else travel_m[keyframe_id] - travel_m[self._last.keyframe_id]
-        if since_m < BREAK_TRAVEL_M:
+        if self._last is not None and self._is_tracked(self._last.keyframe_id, keyframe_id):
             tracked = self._tracked(keyframe_id, watch)
             if isinstance(tracked, Placement):
                 return self._taken((tracked,)), None
@@ -116,7 +116,7 @@ class Placer:
 
     def _confirmed(self, found: Placement) -> tuple[tuple[Placement, ...], Rejected | None]:
         """The location with an earlier one that is consistent with it; it waits if there is none."""
-        if self._last is not None and self._agree(self._last, found, BREAK_TRAVEL_M):
+        if self._last is not None and self._agree(self._last, found, np.inf):
             return self._taken((found,)), None
         for earlier in reversed(self._found):
             if self._agree(earlier, found, WAITING_M):
@@ -126,11 +126,16 @@ class Placer:
 
     def _agree(self, earlier: Placement, later: Placement, within_m: float) -> bool:
         """True if odometry leads from one location to the other, over less than this travel."""
+        if not self._is_tracked(earlier.keyframe_id, later.keyframe_id):
+            return False
         travel_m = self._graph.travel_m
-        way_m = float(travel_m[later.keyframe_id] - travel_m[earlier.keyframe_id])
-        if way_m >= within_m:
+        if travel_m[later.keyframe_id] - travel_m[earlier.keyframe_id] >= within_m:
             return False
         return self._contradiction(earlier, later.keyframe_id, later.T_world_keyframe) is None
+
+    def _is_tracked(self, earlier_id: int, later_id: int) -> bool:
+        """True if no break lies between two keyframes."""
+        return bool(self._graph.num_breaks[earlier_id] == self._graph.num_breaks[later_id])
 
     def _contradiction(self, earlier: Placement, keyframe_id: int, T_world_keyframe: Transform) -> Rejected | None:
         """Rejects a pose that contradicts an earlier placement and the odometry since."""

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from segslam.candidates.places import OTHER_PLACE_M
-from segslam.candidates.proximity import BREAK_STEP_M
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
@@ -123,7 +122,7 @@ def _both(earlier: Session, session: Session, config: Config) -> tuple[PoseGraph
     graph = PoseGraph(config.graph)
     first_id = len(earlier.travel_m)
     for number, one in enumerate((earlier, session)):
-        shift_m = number * (float(earlier.travel_m[-1]) + BREAK_STEP_M)
+        shift_m = number * float(earlier.travel_m[-1])
         informations = one.run.result.keyframe_informations()
         if number:
             informations[0] = FIRST_MOTION.information

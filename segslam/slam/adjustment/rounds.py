@@ -144,8 +144,10 @@ def adjust(
     end_s = started + 60.0 * config.adjustment.max_minutes
     if started >= end_s:
         return None
-    T_before, travel_m = graph.T_world_keyframes, graph.travel_m
-    sweep = known.sweep if known else measure_sweep(points_of, T_before, travel_m, velocities, config=config.refine)
+    T_before = graph.T_world_keyframes
+    sweep = (
+        known.sweep if known else measure_sweep(points_of, T_before, graph.num_breaks, velocities, config=config.refine)
+    )
     last = _rounds(graph, points_of, velocities, sweep, known, config, end_s, progress)
     if last is None:
         return None

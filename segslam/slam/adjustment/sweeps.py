@@ -16,7 +16,6 @@ from jaxtyping import Float
 from scipy.optimize import brentq
 from scipy.stats import t as student
 
-from segslam.candidates.proximity import BREAK_TRAVEL_M
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.trajectory import Poses
@@ -116,13 +115,13 @@ def common_sweep(sweeps: Sequence[Sweep | None]) -> Sweep | None:
 
 
 def measure_sweep(
-    points_of: PointsOf, T_world: Poses, travel_m: Vector, velocities: Velocities, *, config: RefineConfig
+    points_of: PointsOf, T_world: Poses, num_breaks: Indices, velocities: Velocities, *, config: RefineConfig
 ) -> Sweep | None:
     """The sweep by pairs of keyframes of a drive; None if too few show one, or not significantly.
 
-    `travel_m` (n,): length of the path.
+    `num_breaks` (n,): number of breaks before each keyframe.
     """
-    pairs = _pairs(travel_m, velocities)
+    pairs = _pairs(num_breaks, velocities)
     per_second = velocities.per_second
 
     @cache
@@ -164,10 +163,10 @@ def measure_sweep(
     return Sweep(duration_s + float(last.value[best]) / share, float(last.sigma[best]) / share, from_deg)
 
 
-def _pairs(travel_m: Vector, velocities: Velocities) -> list[tuple[int, int]]:
+def _pairs(num_breaks: Indices, velocities: Velocities) -> list[tuple[int, int]]:
     """(older, newer) keyframes in which the sensor turned fastest, each in one pair, so that pairs are independent."""
-    older = np.arange(max(len(travel_m) - STEPS[0], 0))
-    older = older[travel_m[older + STEPS[0]] - travel_m[older] < BREAK_TRAVEL_M]
+    older = np.arange(max(len(num_breaks) - STEPS[0], 0))
+    older = older[num_breaks[older + STEPS[0]] == num_breaks[older]]
     turning = np.linalg.norm(velocities.per_second[:, :3], axis=1)
     chosen: list[tuple[int, int]] = []
     used = set[int]()

@@ -30,8 +30,6 @@ GOOD_START = 0.5
 """The file's poses are a start of their own where this share of the closures fits them. Chosen."""
 GENEROUS = 4.0
 """Closures with an error below this many bounds are also tried as inliers. Chosen: twice the error of an inlier."""
-CONSISTENT = 0.999
-"""Two correct measurements of one motion differ by less than this quantile of the chi-square distribution. Chosen."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,7 +159,7 @@ def contradicting(odometry: Sequence[Edge]) -> list[list[Edge]]:
     same: dict[int, list[Edge]] = defaultdict(list)
     for edge in odometry:
         same[min(edge.a, edge.b)].append(edge)
-    bound = noise.inlier_bound(CONSISTENT)
+    bound = noise.inlier_bound(1.0 - noise.SIGNIFICANT)
     return [edges for edges in same.values() if any(_chi2(one, other) > bound for one, other in combinations(edges, 2))]
 
 

@@ -25,9 +25,6 @@ from segslam.graph.levenberg_marquardt import search
 
 MUCH_LESS = 0.5
 """Chosen: the correction is used if the rest of the drift needs at most this share of the noise."""
-RATE_COST = 3.0
-"""Chosen: least decrease of the error (half the chi-square) for which a second rate is used, as in Bayes' criterion for
-some hundred motions."""
 MOST_COMPARED = 300
 """Chosen: number of closures, spread over the drive, that are compared pairwise."""
 INDEPENDENT = 1e-6
@@ -80,6 +77,7 @@ def steady_drift(
     if before <= tolerated:
         return None
     trials = []
+    rate_cost = 0.5 * math.log(len(odometry))  # Schwarz 1978: the Bayesian information criterion of two models
     for model in ([0], [1], [0, 1]):  # rates by travel, by time, by both
         if not growth[:, model].any(axis=0).all():
             continue
@@ -89,7 +87,7 @@ def steady_drift(
             corrected = rotated(odometry, turns)
             found = search(joined(prior, factor_graph(corrected), factor_graph(closures)), at)
             at = found.values
-        trials.append((found.error + RATE_COST * len(model), turns, corrected, at))
+        trials.append((found.error + rate_cost * len(model), turns, corrected, at))
     if not trials:
         return None
     _, turns, corrected, at = min(trials, key=lambda trial: trial[0])

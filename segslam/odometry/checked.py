@@ -24,7 +24,7 @@ from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.types import Information, Motion, MotionState, Scan, Transform
 from segslam.graph.edges import BREAK_M
-from segslam.graph.noise import odometry_information
+from segslam.graph.noise import SIGNIFICANT, odometry_information
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, is_usual
@@ -35,12 +35,6 @@ from segslam.registration.refinement import MIN_POINTS, SHARED_NOISE_DEG, SHARED
 ELSEWHERE_M = 30.0
 ANYWHERE = geometry.tangent(rotation_rad=np.radians(60.0), translation_m=ELSEWHERE_M)
 """Chosen: standard deviations of a motion that no pose explains: the sensor may have been carried anywhere nearby."""
-SIGNIFICANT = 0.001
-"""Chosen: an odometry of other sensors is overruled where its pose is less likely than this, given the scans, and less
-likely motions are not considered; KISS-ICP is off where chance explains its distance from a registration with less;
-and a pose has a good score if its odds of being wrong are less.
-The adjustment has the same share of chance for a sweep that scans show, for surfaces that become thicker, and for a
-pose out of reach of an alignment."""
 MOST_OFF = float(chi2.isf(SIGNIFICANT, 6))
 """Chi-square above which a pose of the odometry is significantly off the registered one."""
 MOST_OFF_TOGETHER = float(chi2.isf(SIGNIFICANT, 6 * WINDOW))

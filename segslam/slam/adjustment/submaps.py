@@ -16,8 +16,8 @@ from segslam.core.config import RefineConfig
 from segslam.core.points import voxel_means
 from segslam.core.trajectory import Poses
 from segslam.core.types import IndexPairs, Indices, Points, Transform, Vector
+from segslam.graph.noise import SIGNIFICANT
 from segslam.keyframes import is_known
-from segslam.odometry.checked import SIGNIFICANT
 from segslam.registration.refinement import LightSurface, downsample
 from segslam.slam.adjustment.alignment import SEARCH_M, Alignment, PointsOf, align
 

@@ -14,7 +14,7 @@ from segslam.core.points import cell_keys, group_moments, within_range
 from segslam.core.processes import in_parts
 from segslam.core.trajectory import Poses
 from segslam.core.types import IndexPairs, Points, Transform, Vector
-from segslam.odometry.checked import SIGNIFICANT
+from segslam.graph.noise import SIGNIFICANT
 
 CELL_M = 1.0
 """Chosen: edge of the cells that hold a patch; walls and roads are flat over it."""

@@ -17,6 +17,10 @@ class BadScan(SegslamError):
     """A scan that cannot be used; other scans are not affected. Report it, skip it, count it."""
 
 
+class LateScan(BadScan):
+    """A scan whose stamp is not later than that of the previous scan."""
+
+
 def brief(text: str, num_characters: int = 80) -> str:
     """The text on one line, cut to a length that a person reads."""
     text = " ".join(text[: 4 * num_characters].split())

@@ -8,9 +8,10 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import Config
+from segslam.core.errors import LateScan
 from segslam.core.threads import Stopwatch
 from segslam.core.trajectory import Poses
-from segslam.core.types import BadScan, Indices, Motion, MotionState, Scan, Step, Transform
+from segslam.core.types import Indices, Motion, MotionState, Scan, Step, Transform
 from segslam.keyframes import KeyframeSelector
 from segslam.odometry.checked import CheckedOdometry
 from segslam.odometry.kiss import KissOdometry
@@ -60,9 +61,9 @@ class Tracker:
         ignores the scan, if it cannot be used or is not later than the previous scan.
         """
         if self._last_stamp_ns is not None and scan.stamp_ns <= self._last_stamp_ns:
-            raise BadScan(
+            raise LateScan(
                 f"scan {scan.index}: its stamp {scan.stamp_ns} ns is not later than that of the previous scan, "
-                f"{self._last_stamp_ns} ns; give each scan once, in order of time"
+                f"{self._last_stamp_ns} ns; give each scan once, in order of time and by one clock"
             )
         index = self._num_tracked if scan.index is None else scan.index
         scan = replace(scan, index=index)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from segslam.core.config import config_to_yaml
+from segslam.core.errors import LateScan
 from segslam.core.memory import give_back, peak_mb
 from segslam.core.threads import in_other_thread
 from segslam.core.trajectory import travelled_m
@@ -78,7 +79,7 @@ class Run:
         self.folder = folder
         self.num_steps = 0
         self.config = slam.config
-        self.num_scans_skipped = 0
+        self.num_scans_skipped = self._num_scans_late = 0
         self.num_scans_resumed = 0
         self._dataset = dataset
         self._reference = reference
@@ -180,6 +181,7 @@ class Run:
         """Close loops for a tracked scan, and log the step; a bad scan is reported and counted."""
         if isinstance(tracked, BadScan):
             self.num_scans_skipped += 1
+            self._num_scans_late += isinstance(tracked, LateScan)
             self._report(tracked)
             return tracked
         return self._logged(self._slam.close_loops(tracked, tries_loops=tries_loops))
@@ -219,6 +221,7 @@ class Run:
         return result, {
             "num_scans": len(result.trajectory),
             "num_scans_skipped": self.num_scans_skipped,
+            "num_scans_late": self._num_scans_late,
             "length_m": float(travelled_m(result.trajectory.T_world_lidar)[-1]),
             "duration_s": float(np.ptp(result.trajectory.stamp_ns)) / 1e9,
             "num_keyframes": len(result.keyframe_rows),

@@ -8,6 +8,7 @@ import pytest
 from helpers.drives import round_drive, write_kitti_sequence
 
 from segslam import open_dataset
+from segslam.cli.ending import summary
 from segslam.core.config import Config, ProximityConfig
 from segslam.core.types import BadScan, Scan, SegslamError
 from segslam.odometry.sweep import GivenOdometry
@@ -67,6 +68,18 @@ def test_a_stamp_that_is_too_late_or_too_early_loses_its_own_scan_only(
         steps = list(run.map(_Shifted(shifts)))
     assert [row for row, step in enumerate(steps) if isinstance(step, BadScan)] == skipped
     assert len(steps) == 6
+
+
+def test_scans_after_a_clock_was_set_back_are_counted_and_the_summary_names_the_stamps(tmp_path: Path) -> None:
+    slam = Slam(odometry=GivenOdometry(round_drive()[1], Config().odometry))
+    (tmp_path / "run").mkdir()
+    with Run(tmp_path / "run", slam, dataset="made") as run:
+        steps = list(run.map(_Shifted({3: -100, 4: -100, 5: -100})))
+        metrics, _ = run.complete()
+    assert [isinstance(step, BadScan) for step in steps] == [False] * 3 + [True] * 3
+    assert (metrics["num_scans"], metrics["num_scans_skipped"], metrics["num_scans_late"]) == (3, 3, 3)
+    said = summary(metrics, tmp_path / "run")
+    assert "3 scans skipped: a scan before has the same stamp or a later one; correct the stamps" in said
 
 
 @pytest.mark.parametrize("is_finished", [False, True])

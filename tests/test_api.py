@@ -185,6 +185,10 @@ WRONG_KINDS = {
     "segslam.localise(None, '.', 'run')": "None: not a path",
     "segslam.georeference(5, 'fixes.csv')": "5: not a path",
     "segslam.open_dataset('.', frames=5)": "frames 5: give a text, 'A:B'",
+    "segslam.open_dataset('kitti', sequence=0)": "sequence 0: give a text, for example '00'",
+    "segslam.open_dataset('kitti', labels=5)": "labels 5: give a text",
+    "segslam.fleet(5, 'fleet')": "5: not a path",
+    "segslam.export(made, 5)": "5: not a path",
     "segslam.fleet(['.'], 'fleet', num_workers=0)": "num_workers=0",
     "segslam.Scan(np.ones((5, 3)), 0.5)": "stamp_ns 0.5: give integer nanoseconds",
     "segslam.Scan(np.ones((5, 3)), 0, times=np.ones(3))": "3 times for 5 points",
@@ -198,10 +202,11 @@ WRONG_KINDS = {
 }
 
 
-def test_arguments_of_a_wrong_kind_are_refused_by_name(tmp_path: Path) -> None:
+def test_arguments_of_a_wrong_kind_are_refused_by_name(made: MadeRun, tmp_path: Path) -> None:
     """In another process, where no test checks the types."""
     np.ones((200, 4), "<f4").tofile(tmp_path / "scan.bin")
-    lines = ["import numpy as np", "import segslam"]
+    write_kitti_sequence(tmp_path / "kitti", num_scans=1)
+    lines = ["import numpy as np", "import segslam", f"made = {str(made.folder)!r}"]
     for call in WRONG_KINDS:
         lines += ["try:", f"    {call}", "except segslam.SegslamError as error:", "    print(error)"]
     script = "\n".join(lines)
@@ -209,7 +214,7 @@ def test_arguments_of_a_wrong_kind_are_refused_by_name(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     complaints = done.stdout.splitlines()
     assert [one for one, said in zip(WRONG_KINDS.values(), complaints, strict=True) if one not in said] == []
-    assert {file.name for file in tmp_path.iterdir()} == {"scan.bin"}
+    assert {file.name for file in tmp_path.iterdir()} == {"scan.bin", "kitti"}
 
 
 @pytest.mark.long

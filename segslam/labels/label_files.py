@@ -70,6 +70,8 @@ def open_labels(source: str, *, beside: Path, scan_names: Sequence[str], encodin
     Raises SegslamError for a folder that is missing or labels none of the scans, for files whose encoding is neither
     given nor detectable, and for a network that `open_network` rejects.
     """
+    if not isinstance(source, str):
+        raise SegslamError(f"labels {source!r}: give a text: auto, none, geometric, network:MODEL.onnx or a folder")
     has_files = source not in ("none", "geometric") and not source.startswith(NETWORK)
     if encoding and not has_files:
         raise SegslamError(f"--encoding {encoding}: only label files have one; omit it with --labels {source}")

@@ -1,7 +1,7 @@
 """A finished run, written to files: its map, and its trajectory and origin on the globe (GeoJSON, KML, GPX, YAML)."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -46,7 +46,7 @@ def export(
     """
     log = read_log(expanded(run))
     config = load_config(None, settings, base=log.config).map
-    several = [files] if isinstance(files, str | Path) else files
+    several = files if isinstance(files, Iterable) and not isinstance(files, str) else [files]
     return write_maps(log, [expanded(file) for file in several], config=config)
 
 

@@ -157,6 +157,8 @@ def _is_sequence(folder: Path) -> bool:
 
 def _find_sequence(data: Path, sequence: str) -> tuple[Path, Path]:
     """Folder of the sequence, and file of its true poses, which may be missing."""
+    if not isinstance(sequence, str):
+        raise SegslamError(f"sequence {sequence!r}: give a text, for example '00'")
     if not (data / "sequences").is_dir() and _is_sequence(data):
         folder = data.resolve()
         if folder.parent.name == "sequences" and sequence.zfill(2) not in ("00", folder.name):

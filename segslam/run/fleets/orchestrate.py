@@ -4,7 +4,7 @@ import fcntl
 import json
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -70,7 +70,10 @@ def fleet(
     """
     if num_workers is not None and num_workers < 1:
         raise SegslamError(f"fleet: num_workers={num_workers}; give 1 or more")
-    listed = read_drives(expanded(drives)) if isinstance(drives, str | Path) else drives_of(drives)
+    if isinstance(drives, Iterable) and not isinstance(drives, str):
+        listed = drives_of(drives)
+    else:
+        listed = read_drives(expanded(drives))
     if not listed:
         raise SegslamError("fleet: no drive; give recordings, or a list of them")
     folder = expanded(out).resolve()

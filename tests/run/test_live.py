@@ -4,6 +4,7 @@ import signal
 import threading
 from pathlib import Path
 from time import sleep
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from helpers.hanging_source import HangingSource
 from helpers.live_command import LiveCommand, record, write_scan
 from helpers.terminal import in_terminal
 
-from segslam.cli.live import too_slow
+from segslam.cli.live import LiveFigures, too_slow
 from segslam.core import geometry
 from segslam.core.config import Config, OdometryConfig
 from segslam.core.evaluation import trajectory_metrics
@@ -22,6 +23,7 @@ from segslam.odometry.apart import OdometryApart
 from segslam.odometry.kiss import KissOdometry
 from segslam.output.finished import read_run
 from segslam.output.log import LogWriter, read_log
+from segslam.output.words import FIGURES
 from segslam.run.live.folder import FolderSource, stamp_of_name
 from segslam.run.live.front import Front
 from segslam.run.live.waiting import Rhythm, Tally, Waiting
@@ -207,6 +209,13 @@ def test_odometry_that_knows_of_a_gap_predicts_by_the_velocity() -> None:
 
 def _ahead(distance_m: float) -> np.ndarray:
     return geometry.transform(np.eye(3), [distance_m, 0, 0])
+
+
+def test_the_figures_of_a_live_run_have_their_meaning_in_the_report() -> None:
+    figures = LiveFigures(SimpleNamespace(tally=Tally(), num_restarts=0))  # type: ignore[arg-type]
+    placed = SimpleNamespace(latency_s=0.1, is_keyframe=True)
+    figures.note(placed, lag_s=0.2, tries_loops=False)  # type: ignore[arg-type]
+    assert {key for key, value in figures.metrics().items() if not isinstance(value, dict)} <= FIGURES.keys()
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from segslam.cli.checks import check_exists, check_free, check_own, check_run
 from segslam.cli.console import Terminal
 from segslam.cli.options import OverwriteOption, set_option
 from segslam.cli.tables import TableFiles, as_text, with_meanings
-from segslam.core.errors import SegslamError, WorkFailed
+from segslam.core.errors import SegslamError, WorkFailed, counted
 from segslam.core.interrupts import when_stopped
 
 SOURCE = "replayed.txt"
@@ -35,7 +35,7 @@ def compare(
         check_exists(folder, "give run folders")
     names = _names(runs)
     check_free([plot, tables.csv, tables.latex], overwrite=overwrite)
-    terminal.announce(f"compare: reading {len(runs)} runs")
+    terminal.announce(f"compare: reading {counted(len(runs), 'run')}")
     from segslam.output.finished import read_metrics, read_run
     from segslam.output.report.comparison import check_picture, draw_runs
     from segslam.output.words import FIGURES

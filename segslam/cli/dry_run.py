@@ -3,7 +3,7 @@
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from segslam.core.errors import BadScan, SegslamError
+from segslam.core.errors import BadScan, SegslamError, counted
 
 if TYPE_CHECKING:
     from segslam.core.config import Config
@@ -52,12 +52,12 @@ def lines(found: dict[str, Any]) -> str:
     rate = f", {found['scans_per_second']:.1f}/s" if found["scans_per_second"] else ""
     nearest, middle, farthest = scan["range_m"]
     low, high = scan["elevation_deg"]
-    truth = f"for {found['num_true_poses']} scans" if found["num_true_poses"] else "none"
+    truth = f"for {counted(found['num_true_poses'], 'scan')}" if found["num_true_poses"] else "none"
     changed = ", ".join(f"{key}={value}" for key, value in found["changed_settings"].items()) or "defaults"
     return "\n".join(
         [
-            f"{found['data']}: {found['num_scans']} scans, {found['first_scan']} to {found['last_scan']}, over "
-            f"{found['seconds']:.1f} s{rate}",
+            f"{found['data']}: {counted(found['num_scans'], 'scan')}, {found['first_scan']} to {found['last_scan']}, "
+            f"over {found['seconds']:.1f} s{rate}",
             f"scan {scan['scan']}: {scan['num_points']} points at {nearest:.1f} to {farthest:.1f} m (median "
             f"{middle:.1f} m), elevations {low:.1f} to {high:.1f} degrees; "
             f"point times: {'yes' if scan['has_times'] else 'none, points are assumed to be motion-compensated'}; "

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from segslam.cli.console import Terminal
+from segslam.core.errors import counted
 
 if TYPE_CHECKING:
     from segslam.run.run import Run
@@ -82,7 +83,7 @@ def map_summary(figures: dict[str, Any], files: Sequence[Path]) -> str:
     removed = figures["num_map_moving_points"], figures["num_map_voxels_seen_through"]
     return (
         f"map of {figures['num_map_points']} points in {figures['map_seconds']:.1f} s; removed as moving: "
-        f"{removed[0]} points by class, {removed[1]} voxels that other scans see through\n"
+        f"{counted(removed[0], 'point')} by class, {counted(removed[1], 'voxel')} that other scans see through\n"
         f"{written}"
     )
 
@@ -125,11 +126,6 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
         f"next: {follows}; all commands: segslam --help",
     ]
     return "\n".join(lines)
-
-
-def counted(number: int, thing: str) -> str:
-    """A number and its noun, in the plural if it is not 1."""
-    return f"{number} {thing}{'s' * (number != 1)}"
 
 
 def _adjustment(metrics: dict[str, Any]) -> str:

@@ -9,7 +9,7 @@ from segslam.cli.checks import check_exists, check_free, check_links
 from segslam.cli.console import Terminal
 from segslam.cli.ending import map_summary
 from segslam.cli.options import GnssOptions, OverwriteOption, Settings
-from segslam.core.errors import SegslamError
+from segslam.core.errors import SegslamError, counted
 
 FormatOf = Literal["kitti", "tum", "csv"] | None
 
@@ -75,7 +75,7 @@ def convert(
     num_poses = convert_file(
         source, target, source_format=source_format, target_format=target_format, times=times, calib=calib, to=to_frame
     )
-    terminal.answer({"num_poses": num_poses, "file": str(target)}, f"{num_poses} poses in {target}")
+    terminal.answer({"num_poses": num_poses, "file": str(target)}, f"{counted(num_poses, 'pose')} in {target}")
 
 
 def georeference(run: Annotated[Path, "Folder of a finished run."], *, gnss: GnssOptions, terminal: Terminal) -> None:

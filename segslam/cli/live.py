@@ -15,10 +15,10 @@ import typer
 
 from segslam.cli.checks import check_exists, check_free, live_configs, make_folder, outside, show_preset
 from segslam.cli.console import Terminal, how_to_go_on
-from segslam.cli.ending import counted, finish
+from segslam.cli.ending import finish
 from segslam.cli.options import GnssOptions, PresetOption, RunOutput
 from segslam.cli.viewers import check_display, scene_in, serve_foxglove
-from segslam.core.errors import SegslamError, WorkFailed
+from segslam.core.errors import SegslamError, WorkFailed, counted
 from segslam.core.extras import how_to_install
 from segslam.core.interrupts import stopped_by_signals, when_stopped
 
@@ -259,7 +259,7 @@ class LiveFigures:
         """The status in one line."""
         num = len(self._lag_s)
         rate = num / max(monotonic() - self._started, 1e-9)
-        text = f"live: {num} scans, {rate:.1f}/s"
+        text = f"live: {counted(num, 'scan')}, {rate:.1f}/s"
         if num:
             text += f", pose {median(self._latency_ms[-20:]):.0f} ms after the scan"
             if self._lag_s[-1] > 5.0:

@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from segslam.cli.checks import check_free, check_links, check_run
 from segslam.cli.console import Terminal
-from segslam.cli.ending import counted
 from segslam.cli.options import LogArgument, OverwriteOption
 from segslam.cli.tables import with_meanings
 from segslam.cli.viewers import check_display, scene_in
-from segslam.core.errors import SegslamError
+from segslam.core.errors import SegslamError, counted
 
 if TYPE_CHECKING:
     from segslam.output.log import RunLog

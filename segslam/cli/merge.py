@@ -9,7 +9,7 @@ from segslam.cli.checks import check_exists, check_own, make_folder
 from segslam.cli.console import Terminal
 from segslam.cli.ending import finish, is_interrupted
 from segslam.cli.options import WITH_MAP, RunSettings, Settings, WithMapOption
-from segslam.core.errors import SegslamError
+from segslam.core.errors import SegslamError, counted
 from segslam.core.interrupts import EXIT_STATUS, when_stopped
 
 
@@ -115,6 +115,6 @@ def fleet(
         return
     for number, component in enumerate(result.components):
         error = f", error {component['ate_m']:.3f} m" if "ate_m" in component else ""
-        loops = f"{component.get('num_loops_between', 0)} loops between them"
+        loops = f"{counted(component.get('num_loops_between', 0), 'loop')} between them"
         terminal.say(f"component {number}: {', '.join(component['drives'])}; {loops}{error}")
     terminal.say(f"report: {result.folder / 'report.html'}")

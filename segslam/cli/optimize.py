@@ -9,7 +9,7 @@ import typer
 from segslam.cli.checks import check_free
 from segslam.cli.console import Terminal
 from segslam.cli.options import OverwriteOption
-from segslam.core.errors import SegslamError
+from segslam.core.errors import SegslamError, counted
 from segslam.core.whole_files import whole_file
 
 if TYPE_CHECKING:
@@ -61,7 +61,8 @@ def optimize(
 def _lines(result: "Optimized", out: Path) -> Iterator[str]:
     yield (
         f"error {result.initial_error:.6g} -> {result.final_error:.6g} (half the chi-square of the inlier edges), "
-        f"{result.iterations} iterations, {result.seconds:.3f} s; {result.num_outliers} outliers; written to {out}"
+        f"{counted(result.iterations, 'iteration')}, {result.seconds:.3f} s; "
+        f"{counted(result.num_outliers, 'outlier')}; written to {out}"
     )
     if result.robust_cost is not None:
         yield f"cost under the kernel {result.robust}: {result.robust_cost:.6g}"

@@ -10,7 +10,7 @@ import typer
 from segslam.cli.checks import check_not_read, check_own, check_scans, make_folder
 from segslam.cli.console import Terminal
 from segslam.cli.options import EncodingOption, LabelsOption, Numbering, OverwriteOption, ScanOptions, Settings
-from segslam.core.errors import BadScan, SegslamError
+from segslam.core.errors import BadScan, SegslamError, counted
 
 if TYPE_CHECKING:
     from segslam.scans import Dataset
@@ -72,7 +72,8 @@ def label(
 def _table(figures: dict[str, Any], folder: Path) -> str:
     """The figures as text, one line per class."""
     scores = figures.get("iou", {})
-    lines = [f"{figures['num_scans']} scans, {figures['num_points']} points, {figures['ms_per_scan']:.0f} ms per scan"]
+    scans = counted(figures["num_scans"], "scan")
+    lines = [f"{scans}, {figures['num_points']} points, {figures['ms_per_scan']:.0f} ms per scan"]
     lines.append(f"{'class':16}{'share':>8}{'IoU':>8}" if scores else f"{'class':16}{'share':>8}")
     for name in [*figures["shares"], *(name for name in scores if name not in figures["shares"])]:
         score = f"{scores[name]:8.3f}" if name in scores else ""

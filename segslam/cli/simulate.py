@@ -10,7 +10,7 @@ from segslam.cli.completion import simulation_settings
 from segslam.cli.console import Terminal, how_to_go_on
 from segslam.cli.map import map_data
 from segslam.cli.options import GnssOptions, OverwriteOption, RunOptions, RunOutput, set_option
-from segslam.core.errors import SegslamError
+from segslam.core.errors import SegslamError, counted
 from segslam.core.interrupts import interrupts_wait, same_command_with, when_stopped
 
 SEQUENCE = "00"
@@ -75,7 +75,7 @@ def simulate(
     only = _named(pairs, total, sample=sample) if pairs else None
     total = len(only) if only is not None else total
     prepare_folder(out, sequence, overwrite=overwrite)
-    terminal.say(f"building the world for {total} scans")
+    terminal.say(f"building the world for {counted(total, 'scan')}")
     written = write_drive(out, sequence, drive, config=config, seed=seed, driven=driven, num_frames=frames, only=only)
     last = 0
     begin_again = f"to start again: {same_command_with('--overwrite')}"
@@ -86,11 +86,11 @@ def simulate(
                 if interrupts:
                     break
     except KeyboardInterrupt:
-        when_stopped(f"{last} scans are complete in {out / 'sequences' / sequence}; {begin_again}")
+        when_stopped(f"{counted(last, 'scan')} complete in {out / 'sequences' / sequence}; {begin_again}")
         raise
     folder, true_poses = out / "sequences" / sequence, out / "poses" / f"{sequence}.txt"
     figures = {"num_scans": last, "sequence": str(folder), "poses": str(true_poses)}
-    terminal.answer(figures, f"{last} scans in {folder}, true poses in {true_poses}")
+    terminal.answer(figures, f"{counted(last, 'scan')} in {folder}, true poses in {true_poses}")
 
 
 def demo(

@@ -27,6 +27,11 @@ def brief(text: str, num_characters: int = 80) -> str:
     return text if len(text) <= num_characters else f"{text[:num_characters]}..."
 
 
+def counted(number: int, thing: str) -> str:
+    """A number and its noun, in the plural if it is not 1."""
+    return f"{number} {thing}{'s' * (number != 1)}"
+
+
 def unreadable(path: object, content: str, error: Exception) -> str:
     """Start of the message about a file that is missing, or whose content cannot be read; a remedy follows."""
     if isinstance(error, FileNotFoundError):

@@ -8,6 +8,7 @@ from functools import reduce
 from operator import xor
 from pathlib import Path
 
+from segslam.core.errors import counted
 from segslam.core.types import SegslamError
 from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
 
@@ -39,7 +40,7 @@ def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
         kind = sentences[number][0][-3:]
         if kind in found:
             found[kind].append(_row(file, number, kind, sentences[number], moment))
-    left_out = f"; {num_wrong} lines with wrong checksums left out" if num_wrong else ""
+    left_out = f"; {counted(num_wrong, 'line')} with wrong checksums left out" if num_wrong else ""
     left_out += "" if is_checked else "; no line has a checksum"
     if not found["GGA"]:
         return found["RMC"], f"no heights{left_out}"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from segslam.core.config import Config
-from segslam.core.errors import unreadable
+from segslam.core.errors import counted, unreadable
 from segslam.core.trajectory import PoseFormat, lidar_from_camera, read_poses, rows_of_same_stamp
 from segslam.core.types import LoopAttempt, Motion, SegslamError, Trajectory, Transform
 from segslam.core.whole_files import expanded
@@ -46,8 +46,8 @@ class FinishedRun:
     """Command-line options of the run other than settings, such as `frames`; empty for a replay."""
 
     def __repr__(self) -> str:
-        scans, error = len(self.result.trajectory), self.metrics.get("ate_m")
-        return f"FinishedRun({str(self.folder)!r}, {scans} scans{'' if error is None else f', error {error:.3f} m'})"
+        scans, error = counted(len(self.result.trajectory), "scan"), self.metrics.get("ate_m")
+        return f"FinishedRun({str(self.folder)!r}, {scans}{'' if error is None else f', error {error:.3f} m'})"
 
     def _repr_html_(self) -> str:
         """The trajectory and the figures, for notebooks."""

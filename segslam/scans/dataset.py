@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.core.errors import brief
+from segslam.core.errors import brief, counted
 from segslam.core.geometry import raise_beams
 from segslam.core.points import squared_ranges
 from segslam.core.trajectory import nanoseconds
@@ -75,7 +75,7 @@ class Dataset:
     _has_intensities: bool
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.name!r}, {len(self)} scans)"
+        return f"{type(self).__name__}({self.name!r}, {counted(len(self), 'scan')})"
 
     def __len__(self) -> int:
         return len(self.scan_index)

@@ -18,7 +18,7 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 
 from segslam.core.config import parse_yaml
-from segslam.core.errors import SegslamError
+from segslam.core.errors import SegslamError, counted
 from segslam.core.extras import how_to_install
 from segslam.scans.scan_files import MAX_SCAN_BYTES
 
@@ -65,7 +65,7 @@ class InOrder(Generic[Message]):
             self._damage = f"the recording ends after {self._next} of {self._num_messages} messages"
             raise ValueError(self._damage) from None
         except Exception as error:  # of a foreign reader, whose iterator has ended with it
-            self._damage = f"the recording is damaged after {self._next} messages: {type(error).__name__}"
+            self._damage = f"the recording is damaged after {counted(self._next, 'message')}: {type(error).__name__}"
             raise
 
 

@@ -175,7 +175,7 @@ def test_fixes_are_read_as_they_were_written(kind: str, tmp_path: Path) -> None:
     if kind in WITH_SIGMA:
         np.testing.assert_allclose(fixes.sigma_m, np.tile(WITH_SIGMA[kind], (3, 1)), rtol=1e-6)
     if kind == "nmea":
-        assert "1 lines with wrong checksums left out" in fixes.note
+        assert "1 line with wrong checksums left out" in fixes.note
 
 
 def test_a_topic_is_read_from_the_recording_that_is_mapped(tmp_path: Path) -> None:

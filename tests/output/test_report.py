@@ -202,6 +202,13 @@ def test_same_run_gives_the_same_page(scored: Path, tmp_path: Path) -> None:
     assert write_report(folder).read_text() == scored.read_text()
 
 
+def test_one_loop_is_in_the_singular(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run").folder)
+    for num_loops, text in ((1, "<b>1</b>loop accepted"), (2, "<b>2</b>loops accepted")):
+        html = page(replace(run, metrics={"num_loops_accepted": num_loops}), {}, top="", gallery="", about={})
+        assert text in html
+
+
 def test_run_without_loops_is_drawn(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path / "run").folder)
     bare = replace(run, metrics={}, result=replace(run.result, attempts=()))

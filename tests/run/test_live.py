@@ -116,7 +116,7 @@ def test_a_file_is_read_once_when_it_is_closed_or_renamed(tmp_path: Path) -> Non
     source, waiting, stopped = FolderSource(tmp_path), Waiting(most=9), threading.Event()
     output: list[str] = []
     source.open(output.append)
-    assert "1 scans already in" in output[0]
+    assert "1 scan already in" in output[0]
     thread = threading.Thread(target=source.feed, args=(waiting, stopped))
     thread.start()
     try:
@@ -216,6 +216,7 @@ def test_the_figures_of_a_live_run_have_their_meaning_in_the_report() -> None:
     placed = SimpleNamespace(latency_s=0.1, is_keyframe=True)
     figures.note(placed, lag_s=0.2, tries_loops=False)  # type: ignore[arg-type]
     assert {key for key, value in figures.metrics().items() if not isinstance(value, dict)} <= FIGURES.keys()
+    assert figures.line().startswith("live: 1 scan, ")
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from importlib import resources
 from typing import Any
 
 from segslam.core.config import Config, changed_settings
+from segslam.core.errors import counted
 from segslam.core.types import Rejected
 from segslam.output.finished import COMPARED, FinishedRun, plain_name
 from segslam.output.words import CONDITIONS, FIGURES, FILES, REASONS, WORDS
@@ -18,7 +19,7 @@ def page(run: FinishedRun, plots: Mapping[str, str], *, top: str, gallery: str, 
     """The page; `plots`: caption -> SVG, between the HTML `top` and `gallery`; `about`: metadata of its log."""
     name = run.folder.resolve().name
     num_scans = run.metrics.get("num_scans", len(run.result.trajectory))
-    title = f"{run.dataset or name}: {num_scans} scan{'s' * (num_scans != 1)}"
+    title = f"{run.dataset or name}: {counted(num_scans, 'scan')}"
     sections = [picture_section(caption, svg) for caption, svg in plots.items()]
     sections += [section("Figures", _figures(run.metrics)), section("Loop candidates", _outcomes(run))]
     sections += [section("Files", _files(run)), section("Conditions", _conditions(run, about))]
@@ -81,8 +82,9 @@ def _tiles(metrics: dict[str, Any]) -> str:
         ("scans_per_second", "", "scans per second"),
         ("peak_rss_mb", " MB", "peak memory"),
     ]
-    known = [(key, unit, text) for key, unit, text in tiles if key in metrics]
-    return "".join(f"<div><b>{number(metrics[key])}{unit}</b>{text}</div>" for key, unit, text in known)
+    known = [(metrics[key], unit, text) for key, unit, text in tiles if key in metrics]
+    named = [(value, unit, text.replace("loops", "loop") if value == 1 else text) for value, unit, text in known]
+    return "".join(f"<div><b>{number(value)}{unit}</b>{text}</div>" for value, unit, text in named)
 
 
 def picture_section(caption: str, picture: str | bytes, *, note: str = "") -> str:

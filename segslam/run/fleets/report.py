@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import matplotlib
 from matplotlib.figure import Figure
 
+from segslam.core.errors import counted
 from segslam.core.trajectory import Poses, read_poses
 from segslam.core.whole_files import write_whole
 from segslam.output.report import figures
@@ -28,15 +29,16 @@ def write_report(result: "FleetResult") -> Path:
         if "reason" not in component
     )
     num_mapped = sum(drive["state"] == "mapped" for drive in result.drives.values())
+    components, loops = len(result.components), result.num_loops_between
     body = (
         f'<div class="tiles"><div><b>{num_mapped} of {len(result.drives)}</b>drives mapped</div>'
-        f"<div><b>{len(result.components)}</b>components</div>"
-        f"<div><b>{result.num_loops_between}</b>loops between drives</div></div>\n"
+        f"<div><b>{components}</b>component{'s' * (components != 1)}</div>"
+        f"<div><b>{loops}</b>loop{'s' * (loops != 1)} between drives</div></div>\n"
         f"{section('Components', _components(result))}{section('Drives', _drives(result.drives))}"
         f'<div class="plots">{plots}</div>'
     )
     file = result.folder / "report.html"
-    write_whole(file, document(f"{result.folder.name}: {len(result.drives)} drives", body))
+    write_whole(file, document(f"{result.folder.name}: {counted(len(result.drives), 'drive')}", body))
     return file
 
 

@@ -14,7 +14,7 @@ from threading import Event
 from time import time_ns
 from typing import Any
 
-from segslam.core.errors import unreadable
+from segslam.core.errors import counted, unreadable
 from segslam.core.types import BadScan, Scan, SegslamError
 from segslam.run.live.waiting import WAKE_S, Source, Waiting
 from segslam.scans.clouds import SUFFIXES, read_file
@@ -57,7 +57,7 @@ class FolderSource(Source):
         there = [entry for entry in self._folder.iterdir() if entry.suffix.lower() in SUFFIXES]
         self._has_missed = self._noted_ns.value > 0
         if there and not self._has_missed:
-            tell(f"{len(there)} scans already in {self._folder} are ignored; use segslam map for these")
+            tell(f"{counted(len(there), 'scan')} already in {self._folder} ignored; use segslam map for all scans")
         self._noted_ns.value = self._noted_ns.value or time_ns()
 
     def feed(self, waiting: Waiting, stopped: Event) -> str:

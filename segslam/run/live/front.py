@@ -18,6 +18,7 @@ from threading import Thread
 from typing import Any
 
 from segslam.core.config import Config
+from segslam.core.errors import counted
 from segslam.core.memory import note_peak_of
 from segslam.core.types import SegslamError, Step
 from segslam.odometry.tracker import Tracked
@@ -134,7 +135,7 @@ class Front:
             if self.is_stopping or not self._is_ready:
                 self._received.put(replace(died, failed=not self.is_stopping))  # a death while it stops is no failure
                 return
-            lost = f"{num_lost} scan{'s' * (num_lost != 1)} lost" if num_lost else "no scan lost"
+            lost = f"{counted(num_lost, 'scan')} lost" if num_lost else "no scan lost"
             self._tell(f"{died.why}: {lost}; starting it again ...")
             self._is_ready = False
             self.num_restarts += 1

@@ -62,6 +62,8 @@ def simulate(
 
     Example: segslam simulate streets --sequence 06 --poses kitti/poses/06.txt --frames 300 --seed 1
     """
+    if sample is not None and not pairs:
+        raise SegslamError(f"--sample {sample}: only for lists of pairs; give them with --pairs")
     check_own(out, "sequences", "poses")
     terminal.announce(f"simulate: making a drive in {out}")
     from segslam.bench.simulation.files import prepare_folder, write_drive

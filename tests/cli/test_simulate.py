@@ -111,6 +111,12 @@ def test_it_writes_only_the_scans_in_the_lists_of_pairs(tmp_path):
     np.testing.assert_allclose(dataset.reference.T_world_lidar, whole.T_world_lidar[[1, 2, 4]])
 
 
+def test_a_number_of_pairs_without_a_list_is_refused(tmp_path, capsys):
+    assert simulate(tmp_path / "some", "--sample", 2) == 2
+    assert "--sample 2: only for lists of pairs; give them with --pairs" in capsys.readouterr().err
+    assert not (tmp_path / "some").exists()
+
+
 def test_a_list_of_another_drive_is_refused(tmp_path, capsys):
     (tmp_path / "pairs.txt").write_text("1 400000\n")
     assert simulate(tmp_path / "out", "--pairs", tmp_path / "pairs.txt", "--sensor", "vlp16", "--quiet") == 2

@@ -126,7 +126,8 @@ def _stamp(file: Path, number: int, text: str, *, is_ns: bool) -> int:
     text = text.strip()
     try:
         if re.match(r"\d{4}-\d\d-\d\d", text):
-            return stamp_of(datetime.fromisoformat(text.replace("Z", "+00:00")))
+            text, is_leap = re.subn(r"(\d\d:\d\d):60", r"\1:59", text, count=1)  # the second after 59
+            return stamp_of(datetime.fromisoformat(text.replace("Z", "+00:00"))) + is_leap * 10**9
         if is_ns:
             return int(text)
         value = Decimal(text)

@@ -391,7 +391,7 @@ def test_a_date_whose_neighbour_does_not_exist_is_none(at: str, day: str, tmp_pa
     assert np.diff(read_fixes(tmp_path / "a.nmea").stamp_ns).tolist() == [4_000_000_000]
 
 
-@pytest.mark.parametrize("kind", ["GGA", "RMC", "pos"])
+@pytest.mark.parametrize("kind", ["GGA", "RMC", "pos", "csv"])
 def test_a_leap_second_is_the_second_after_59(kind: str, tmp_path: Path) -> None:
     place = "4800.0,N,00800.0,E"
     lines = [
@@ -399,6 +399,7 @@ def test_a_leap_second_is_the_second_after_59(kind: str, tmp_path: Path) -> None
             "GGA": sentence(f"GPGGA,{at.replace(':', '')},{place},1,8,1,100,M,48,M,,"),
             "RMC": sentence(f"GPRMC,{at.replace(':', '')},A,{place},0,0,311216,,"),
             "pos": f"2016/12/31 {at} 48.0 8.0 100.0 1 9",
+            "csv": f"2016-12-31T{at}Z,48.0,8.0,100.0",
         }[kind]
         for at in ("23:59:59.50", "23:59:60.25")
     ]

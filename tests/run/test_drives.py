@@ -4,7 +4,9 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import onnx
 import pytest
+from helpers.made_networks import made_network
 
 from segslam.core.types import SegslamError
 from segslam.run.fleets.drives import Drive, drives_of, read_drives
@@ -141,3 +143,15 @@ def test_the_settings_of_a_network_change_the_key(tmp_path: Path) -> None:
         model.with_suffix(".yaml").write_text(f"{shared}classes: [{classes}]\n")
         keys.append(drive.key("1"))
     assert keys[0] != keys[1] == keys[2]
+
+
+def test_weights_in_a_separate_file_change_the_key(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    model = made_network(tmp_path)
+    onnx.save(onnx.load(model), model, save_as_external_data=True, location="weights of it", size_threshold=0)
+    (drive,) = read_drives(_written(tmp_path, f"- {{data: a, labels: 'network:{model}'}}"))
+    key = drive.key("1")
+    assert drive.key("1") == key
+    with (tmp_path / "weights of it").open("ab") as stream:
+        stream.write(b"1")
+    assert drive.key("1") != key

@@ -40,8 +40,8 @@ class Drive:
     def key(self, version: str) -> str:
         """A hash of the recording, of the options, and of the version: equal keys stand for equal runs.
 
-        Of a recording the names, sizes and times of its files are used, of a network also its settings. Raises
-        SegslamError if the recording is missing, or if the settings of the network are invalid.
+        Of a recording the names, sizes and times of its files are used, of a network also its settings and separate
+        weights. Raises SegslamError if the recording is missing, or if the settings of the network are invalid.
         """
         options = {name: value for name, value in asdict(self).items() if name not in ("name", "data")}
         gnss = self.gnss if self.gnss and Path(self.gnss).exists() else ""  # otherwise a topic
@@ -54,6 +54,8 @@ class Drive:
         files += [str(file) for file in beside if file.exists()]
         labels = Path(self.labels.removeprefix(NETWORK))
         files += [str(labels)] if labels.is_absolute() and labels.exists() else []  # others are in the recording
+        if self.labels.startswith(NETWORK) and labels.is_file():
+            files += map(str, _separate_weights(labels))
         if self.labels.startswith(NETWORK) and (settings := settings_file(labels)).exists():
             options["network"] = read_settings(settings).model_dump(mode="json")
         return key_of(version, options, _state(data), *(_state(Path(file)) for file in files))
@@ -80,6 +82,17 @@ def _state(path: Path) -> list[tuple[str, int, int]]:
     except OSError as error:
         raise SegslamError(f"{unreadable(path, 'recording', error)}; correct the list of drives") from error
     return [(os.path.relpath(file, path), state.st_size, state.st_mtime_ns) for file, state in states]
+
+
+def _separate_weights(model: Path) -> list[Path]:
+    """The files with weights beside a network, which the `external_data` of its tensors name."""
+    try:
+        content = model.read_bytes()
+    except OSError as error:
+        raise SegslamError(f"{unreadable(model, 'network', error)}; correct its permissions") from error
+    places = re.finditer(rb"\n\x08location\x12([\x01-\x7f])", content)
+    names = sorted({content[place.end() : place.end() + place[1][0]] for place in places})
+    return [file for name in names if (file := model.parent / os.fsdecode(name)).is_file()]
 
 
 def _walked(path: Path) -> Iterator[tuple[str, list[str]]]:

@@ -162,6 +162,10 @@ def test_a_run_is_evaluated_exported_and_reported_by_public_names(made: MadeRun,
 def test_odd_arguments_are_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(segslam.SegslamError, match="fleet: no drive"):
         segslam.fleet([], tmp_path / "city")
+    for out in (tmp_path, tmp_path / "scans" / "city"):  # all would be mapped again by the next call
+        with pytest.raises(segslam.SegslamError, match=r"inside the recording .*; give another --out"):
+            segslam.fleet([tmp_path], out)
+    assert list(tmp_path.iterdir()) == []
 
 
 WRONG_KINDS = {

@@ -77,6 +77,8 @@ def fleet(
     if not listed:
         raise SegslamError("fleet: no drive; give recordings, or a list of them")
     folder = expanded(out).resolve()
+    if around := [drive.data for drive in listed if Path(drive.data) in (folder, *folder.parents)]:
+        raise SegslamError(f"{folder}: inside the recording {around[0]}, which it would change; give another --out")
     number = num_workers or max((os.cpu_count() or 1) // CORES_OF_WORKER, 1)
     with _alone_in(folder), workers(folder, number=number, scheduler=scheduler) as (run, dashboard):
         if dashboard:

@@ -77,6 +77,11 @@ def is_kitti(data: Path) -> bool:
 def read_returns(file: Path) -> Float32[np.ndarray, "_ 4"]:
     """(n, 4) x, y, z, intensity of a velodyne file, as stored. Raises BadScan if it is invalid."""
     content = read_bytes(file)
+    if _is_float64(content):
+        raise BadScan(
+            f"{file}: its values are not float32 (x y z intensity) but like float64; if x y z come first, 4 values per "
+            "point, convert it in Python: numpy.save('NAME.npy', numpy.fromfile('NAME.bin', '<f8').reshape(-1, 4))"
+        )
     values = np.frombuffer(content[: len(content) // 4 * 4], dtype="<f4")
     if (num := _values_per_point(values)) != 4:
         raise BadScan(
@@ -89,6 +94,19 @@ def read_returns(file: Path) -> Float32[np.ndarray, "_ 4"]:
             "values per point; copy the file again, or convert it"
         )
     return values.reshape(-1, 4)
+
+
+def _is_float64(content: bytes) -> bool:
+    """True for values of 8 bytes: read as float32, half of them are the last digits of numbers, with any exponent.
+
+    Their binary logarithms then spread by more than the digits of a float32 (standard deviation), and by less than an
+    eighth of that if read as float64, whose exponent has 11 bits; numbers with 8 bits would spread eight times as much.
+    """
+    values = np.frombuffer(content[: len(content) // 8 * 8], "<f8")
+    values = values[:: max(len(values) // MOST_COMPARED, 1)].copy()
+    known = (read[np.isfinite(read) & (read != 0.0)] for read in (values.view("<f4"), values))
+    as_single, as_double = (np.log2(np.abs(one)).std(dtype=float) if len(one) else 0.0 for one in known)
+    return bool(8.0 * as_double < as_single > np.finfo(np.float32).nmant)
 
 
 def _values_per_point(values: Float32[np.ndarray, " _"]) -> int:

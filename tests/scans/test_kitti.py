@@ -140,6 +140,26 @@ def test_a_file_of_three_values_per_point_is_rejected(tmp_path: Path) -> None:
     assert len(read_returns(file)) == 12_000
 
 
+def test_values_of_float64_are_rejected_and_odd_ones_of_float32_are_read(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    file = tmp_path / "000000.bin"
+    points = (rng.normal(size=(12_000, 4)) * [20.0, 12.0, 0.8, 1.0]).astype(np.float32)
+    missing = points.astype(float)
+    missing[::2] = np.nan
+    for values in (points, points[:20], points[:, :3], 1e-3 * rng.integers(-20_000, 20_000, size=(9000, 5)), missing):
+        values.astype("<f8").tofile(file)
+        with pytest.raises(BadScan, match=r"000000\.bin: its values are not float32 .* but like float64; .*<f8"):
+            read_returns(file)
+    flat, dark, far = points.copy(), points.copy(), points.copy()
+    flat[:, 2] = 1e-17 * points[:, 0]
+    dark[:, 3] = 0.0
+    far[::2, :3] = np.finfo(np.float32).max
+    wall = np.column_stack([points[:, 0], np.ones_like(points[:, :2]), points[:, 2]])[:, [0, 1, 3, 2]]
+    for values in (flat, dark, far, wall, points[:1], np.zeros((5, 4), np.float32)):
+        values.astype("<f4").tofile(file)
+        assert len(read_returns(file)) == len(values)
+
+
 @pytest.mark.parametrize("num_points", [300, 3000, 30_000])
 def test_four_columns_of_one_distribution_are_read(tmp_path: Path, num_points: int) -> None:
     file = tmp_path / "000000.bin"

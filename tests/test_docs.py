@@ -26,6 +26,7 @@ from segslam.cli import commands
 from segslam.core.config import Config
 from segslam.core.trajectory import read_poses
 from segslam.core.types import RejectReason
+from segslam.output.log import schema
 from segslam.scans import open_dataset
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -192,6 +193,21 @@ def test_the_site_has_a_page_for_every_command_and_public_name() -> None:
         shown = [parameter for parameter in command.params if not getattr(parameter, "hidden", False)]
         assert all(f"`{option}`" in page for one in shown for option in one.opts if "-" in option)
     assert all(f"## {name}\n" in pages["api_page"]() for name in segslam.__all__ if callable(getattr(segslam, name)))
+
+
+def test_the_page_of_commands_has_defaults_of_zero_and_no_empty_ones() -> None:
+    page = runpy.run_path(str(ROOT / "tools" / "reference_pages.py"))["commands_page"]()
+    assert "| `--lane` | `0.0` |" in page
+    assert "| `--draw` | `0` |" in page
+    assert "| `--topic` |  |" in page
+
+
+def test_the_page_of_files_has_every_topic_of_a_log() -> None:
+    texts = [value for name, value in vars(schema).items() if name.isupper() and isinstance(value, str)]
+    topics = {text for text in texts if text.startswith("/")}
+    page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
+    assert len(topics) > 15
+    assert not {topic for topic in topics if f"`{topic}`" not in page}
 
 
 def test_the_glossary_has_every_reason_and_the_page_is_that_of_the_program() -> None:

@@ -97,7 +97,7 @@ def _row(parameter: Any) -> str:
     names = ", ".join(f"`{name}`" for name in (*parameter.opts, *parameter.secondary_opts))
     name = f"`{parameter.name.upper()}`" if parameter.param_type_name == "argument" else names
     default = parameter.default
-    shown = "" if callable(default) or default in (None, False, ()) else f"`{default}`"
+    shown = "" if callable(default) or default is None or default is False or default == "" else f"`{default}`"
     if parameter.required:
         shown = "required"
     meaning = (getattr(parameter, "help", "") or "").replace("|", "\\|").replace("<", "&lt;")

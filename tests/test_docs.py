@@ -284,6 +284,13 @@ def test_the_commands_and_options_that_a_page_names_exist(page: str) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES)
+def test_a_page_has_one_title(page: str) -> None:
+    """The site lists each heading of the first level as a page of its own."""
+    text = re.sub(r"(?ms)^```.*?^```", "", (ROOT / page).read_text())
+    assert len(re.findall(r"(?m)^# ", text)) == 1, page
+
+
+@pytest.mark.parametrize("page", PAGES)
 def test_the_files_that_a_page_links_to_exist(page: str) -> None:
     for target in re.findall(r"\]\(([^)#]+)\)", (ROOT / page).read_text()):
         assert target.startswith("http") or ((ROOT / page).parent / target).exists(), f"{page}: {target}"

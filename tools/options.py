@@ -40,7 +40,7 @@ USERS = """
 |---|---|---|---|---|
 """
 EXPERTS = """
-# All settings, for experts
+## All settings, for experts
 """
 SOURCE = re.compile(r" \[([^\]]+)\]$")
 SIGNS: dict[type, tuple[str, str]] = {
@@ -67,7 +67,7 @@ def _section(name: str, section: Section) -> str:
     rows = [_row(key, values[key], field, source=True) for key, field in type(section).model_fields.items()]
     about = f"{type(section).__doc__}\n\n" if type(section).__doc__ != Section.__doc__ and type(section).__doc__ else ""
     head = "| setting | default | unit | allowed | meaning | source |\n|---|---|---|---|---|---|\n"
-    return f"\n## {name}\n\n{about}{head}{''.join(rows)}"
+    return f"\n### {name}\n\n{about}{head}{''.join(rows)}"
 
 
 def _row(key: str, value: Any, field: FieldInfo, *, source: bool = False) -> str:

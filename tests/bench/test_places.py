@@ -61,7 +61,7 @@ def test_a_file_without_places_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(SegslamError, match=r"one\.npy: cannot read"):
         read_places(tmp_path / "one.npy")
     file.write_bytes(b"no places")
-    with pytest.raises(SegslamError, match=r"other\.npz: cannot read"):
+    with pytest.raises(SegslamError, match=r"other\.npz: cannot read the places \(it is not a \.npz file\)"):
         read_places(file)
 
 

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from zipfile import BadZipFile
+from zipfile import BadZipFile, is_zipfile
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -47,6 +47,8 @@ def read_places(file: Path) -> SeenPlaces:
     """The places of a file. Raises SegslamError, naming the file, if it is invalid."""
     remedy = "give a file with `columns` (n, size, size) uint8 and `poses` (n, 3, 4)"
     try:
+        if file.is_file() and not is_zipfile(file):
+            raise ValueError("it is not a .npz file")
         with np.load(file) as stored:
             columns, poses = stored["columns"], stored["poses"].astype(np.float64)
     except (OSError, ValueError, KeyError, TypeError, BadZipFile, EOFError) as error:

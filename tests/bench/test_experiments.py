@@ -229,6 +229,10 @@ def test_conditions_in_a_report_contain_no_folder(tmp_path: Path) -> None:
     (tmp_path / "simulation.json").write_text('{"seed": 7}')
     notes = provenance.account("pairs", job, lists, {}, options={})["notes"]
     assert any("SIMULATED (seed 7)" in note for note in notes)
+    assert not any("with true labels" in note for note in notes), "they are predicted"
+    job = Job(DataSource(tmp_path), METHOD_NAMES, Config())
+    notes = provenance.account("pairs", job, lists, {}, options={})["notes"]
+    assert any("with true labels" in note for note in notes)
 
 
 @pytest.fixture

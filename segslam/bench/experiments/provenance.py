@@ -62,7 +62,7 @@ def account(
         "data": f"{job.source.dataset or 'kitti'} {job.source.sequence}",
         "simulation": simulation,
         "lists": [{"name": one.name, "pairs": len(one.pairs), "of": one.num_whole} for one in lists],
-        "notes": _notes(simulation, lists),
+        "notes": _notes(simulation, lists, job.source.labels),
         "options": dict(options),
         "machine": machine(),
         "commit": commit(),
@@ -83,13 +83,14 @@ def _simulation(job: Job) -> dict[str, Any] | None:
     return None
 
 
-def _notes(simulation: dict[str, Any] | None, lists: Sequence[PairList]) -> list[str]:
+def _notes(simulation: dict[str, Any] | None, lists: Sequence[PairList], labels: str) -> list[str]:
     """Notes needed to compare the results with those of the paper."""
     notes = []
     if simulation is not None:
+        known = ", with true labels" if labels in ("auto", "labels") else ""
         notes.append(
-            f"The scans were SIMULATED (seed {simulation['seed']}), at the real poses if they are KITTI's, with true "
-            "labels. No result here was measured on KITTI's own scans."
+            f"The scans were SIMULATED (seed {simulation['seed']}), at the real poses if they are KITTI's{known}. "
+            "No result here was measured on KITTI's own scans."
         )
     if sampled := [one for one in lists if len(one.pairs) < one.num_whole]:
         counts = ", ".join(f"{one.name} {len(one.pairs)} of {one.num_whole}" for one in sampled)

@@ -3,14 +3,16 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from time import sleep
 
 import numpy as np
 import pytest
 
-from segslam.bench.experiments import paper, provenance
+from segslam.bench.experiments import job, paper, provenance
 from segslam.bench.experiments.benchmark import run
 from segslam.bench.experiments.job import Job, failed_row
 from segslam.bench.experiments.method_settings import METHOD_NAMES
+from segslam.bench.experiments.methods import Method
 from segslam.bench.experiments.pairs import (
     PAPER_PAIR,
     PairList,
@@ -25,7 +27,8 @@ from segslam.bench.experiments.pairs import (
 from segslam.bench.experiments.rows import Row, figures, read_rows, results, worst_failures, write_rows
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.types import SegslamError, Trajectory
+from segslam.core.threads import Stopwatch
+from segslam.core.types import Rejected, RejectReason, SegslamError, Trajectory
 from segslam.scans import DataSource
 
 
@@ -233,6 +236,23 @@ def test_conditions_in_a_report_contain_no_folder(tmp_path: Path) -> None:
     job = Job(DataSource(tmp_path), METHOD_NAMES, Config())
     notes = provenance.account("pairs", job, lists, {}, options={})["notes"]
     assert any("with true labels" in note for note in notes)
+
+
+def test_the_first_registration_of_a_process_is_measured_like_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[Stopwatch] = []
+
+    def align(_source: object, _target: object, _config: Config, watch: Stopwatch) -> Rejected:
+        calls.append(watch)
+        sleep(0.3 if len(calls) == 1 else 0.0)  # modules are loaded
+        return Rejected(RejectReason.TOO_FEW_POINTS)
+
+    monkeypatch.setitem(job.METHODS, "loading", Method((), align))
+    trial = Trial("list", ScanVariant(1), ScanVariant(2), np.eye(4))
+    for _ in range(2):
+        [made] = job.register_trial(Job(DataSource(Path()), ("loading",), Config()), trial, ({}, {}), ({}, {}))
+        assert made.ms is not None
+        assert made.ms < 300.0
+    assert len(calls) == 3
 
 
 @pytest.fixture

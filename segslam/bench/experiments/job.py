@@ -2,6 +2,7 @@
 
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -13,7 +14,7 @@ from segslam.bench.experiments.rows import Row
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch
-from segslam.core.types import BadScan, Points, Rejected
+from segslam.core.types import BadScan, Labels, Points, Rejected
 from segslam.labels import geometric_labels
 from segslam.scans import Dataset, DataSource
 
@@ -22,6 +23,9 @@ logger = logging.getLogger(__name__)
 LABELS = "labels"
 BAD_SCAN = "bad_scan"
 """Reject reason of a row whose scan cannot be read."""
+
+_DONE_ONCE: set[object] = set()
+"""Work that this process has done before, unmeasured."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,13 +49,18 @@ def shared_scan(job: Job, variant: ScanVariant) -> Parts | None:
         logger.warning("scan %d skipped: %s", variant.index, error)
         return None
     points, labels = variant.turned(scan.points), scan.labels
+
+    def prepare(labels: Labels) -> Parts:
+        return prepare_parts(points, variant.remaining(labels), methods=job.methods, config=job.config)
+
+    _do_once(job.methods, lambda: prepare(geometric_labels(points)))
     with measured() as cost:
         is_computed = callable(labels)
         if callable(labels):
             labels = labels()
         elif is_computed := dataset.labels.geometric and not labels.any():
             labels = geometric_labels(points)
-    values, costs = prepare_parts(points, variant.remaining(labels), methods=job.methods, config=job.config)
+    values, costs = prepare(labels)
     return values, costs | ({LABELS: cost} if is_computed else {})
 
 
@@ -76,10 +85,18 @@ def open_once(source: DataSource) -> tuple[Dataset, dict[int, int]]:
     return dataset, {int(index): row for row, index in enumerate(dataset.scan_index)}
 
 
+def _do_once(name: object, work: Callable[[], object]) -> None:
+    """Do work unless this process has done it: the first time loads modules and compiled code, for up to seconds."""
+    if name not in _DONE_ONCE:
+        work()
+        _DONE_ONCE.add(name)
+
+
 def _register(method: str, config: Config, trial: Trial, both: tuple[Parts, Parts]) -> Row:
-    watch = Stopwatch()
+    align, watch = METHODS[method].align, Stopwatch()
+    _do_once(method, lambda: align(both[0][0], both[1][0], config, Stopwatch()))
     with measured() as cost:
-        outcome = METHODS[method].align(both[0][0], both[1][0], config, watch)
+        outcome = align(both[0][0], both[1][0], config, watch)
     parts = METHODS[method].parts
     costs = [costs_of[name] for _, costs_of in both for name in parts]
     uses_labels = any(part.endswith("description") for part in parts)

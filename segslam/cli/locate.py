@@ -60,7 +60,7 @@ class ScanFileOptions:
         angle_deg = config.sensor.vertical_angle_deg
         if angle_deg is None:
             angle_deg = VERTICAL_ANGLE_DEG if self.dataset == "kitti" else 0.0
-        return make_scan(file, 0, 0, cloud.points, labels, vertical_angle_deg=angle_deg)
+        return make_scan(file, 0, 0, cloud, labels, vertical_angle_deg=angle_deg)
 
 
 class LabelsCommand(TyperCommand):

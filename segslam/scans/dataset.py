@@ -14,7 +14,6 @@ from segslam.core.trajectory import nanoseconds
 from segslam.core.types import (
     BadScan,
     Indices,
-    Mask,
     Points,
     Scan,
     ScanLabels,
@@ -31,7 +30,6 @@ from segslam.scans.scan_files import sweep_times
 logger = logging.getLogger(__name__)
 
 ASSUMED_PERIOD_NS = 100_000_000  # 10 Hz, the rate of most LiDARs; used if there are no stamps
-NO_TIMES = np.empty(0)
 NO_LIMIT = 2**63 - 1
 
 
@@ -87,10 +85,9 @@ class Dataset:
             file,
             int(self.scan_index[row]),
             stamp_ns,
-            cloud.points,
+            cloud,
             self.labels.read(file.stem, cloud.points, cloud.intensities),
-            times_of(cloud, stamp_ns),
-            intensities=cloud.intensities if self._has_intensities else None,
+            has_intensities=self._has_intensities,
             vertical_angle_deg=self.vertical_angle_deg,
         )
 
@@ -149,53 +146,36 @@ def no_topics(topic: str) -> SegslamError:
     return SegslamError(f"--topic {topic}: only recordings have topics (rosbag, mcap); omit the option")
 
 
-def times_of(cloud: Cloud, stamp_ns: int) -> Vector:
-    """`sweep_times` of the valid points of a cloud; the times of the others, which may be anything, are 0."""
-    if len(cloud.times) != len(cloud.points):
-        return NO_TIMES
-    kept = _is_return(cloud.points)
-    found = sweep_times(cloud.times[kept], int(kept.sum()), stamp_ns * 1e-9)
-    if len(found) == 0:
-        return NO_TIMES
-    times = np.zeros(len(kept))
-    times[kept] = found
-    return times
-
-
-def _is_return(points: Points) -> Mask:
-    """True for points that are finite, as float32, and not the origin."""
-    with np.errstate(over="ignore", invalid="ignore"):  # wild numbers, and NaNs that signal
-        squared_range = squared_ranges(points.astype(np.float32, copy=False))
-    is_return: Mask = np.isfinite(squared_range) & (squared_range > 0)
-    return is_return
-
-
 def make_scan(
     source: Path,
     index: int,
     stamp_ns: int,
-    points: Points,
+    cloud: Cloud,
     labels: ScanLabels,
-    times: Vector = NO_TIMES,
     *,
-    intensities: Vector | None = None,
+    has_intensities: bool = False,
     vertical_angle_deg: float = 0.0,
 ) -> Scan:
     """The scan without invalid points: those with a NaN or infinity, and those at the origin, which mean "no return".
 
     A distance whose square exceeds float32 (1.8e19 m) is infinite. This
     function alone applies `vertical_angle_deg`; label sources see the points as stored. Labels, times and
-    intensities are reduced to the same points. Raises BadScan, naming `source`, if no point remains.
+    intensities are reduced to the same points; the times of the others may be anything. Raises BadScan, naming
+    `source`, if no point remains.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # wild numbers, and NaNs that signal
-        points = points.astype(np.float32, copy=False)
-    kept = _is_return(points)
+        points = cloud.points.astype(np.float32, copy=False)
+        squared_range = squared_ranges(points)
+    kept = np.isfinite(squared_range) & (squared_range > 0)
     if not kept.any():
         what = "has no points" if len(points) == 0 else f"none of its {len(points)} points is finite and not 0, 0, 0"
         raise BadScan(f"{source}: {what}; copy the file again, or leave this scan out")
+    times, intensities = np.empty(0), cloud.intensities if has_intensities else None
+    if len(cloud.times) == len(points):
+        times = sweep_times(cloud.times[kept], int(kept.sum()), (cloud.stamp_ns or stamp_ns) * 1e-9)
     if not kept.all():
-        points, labels, times = points[kept], of_rows(labels, kept), times[kept] if len(times) else times
-        intensities = intensities if intensities is None else intensities[kept]
+        points, labels = points[kept], of_rows(labels, kept)
+        intensities = None if intensities is None else intensities[kept]
     if intensities is not None:
         intensities = np.ascontiguousarray(intensities, dtype=np.float32)
     return Scan(

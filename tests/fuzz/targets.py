@@ -122,7 +122,7 @@ def targets(folder: Path) -> list[Target]:
 
 def _scan(file: Path) -> None:
     cloud = read_file(file)
-    make_scan(file, 0, 0, cloud.points, np.zeros(len(cloud.points), np.uint8), intensities=cloud.intensities)
+    make_scan(file, 0, 0, cloud, np.zeros(len(cloud.points), np.uint8), has_intensities=True)
 
 
 def _recording(data: Path) -> None:

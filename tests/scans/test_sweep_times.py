@@ -1,9 +1,11 @@
 """Times within a sweep, whatever the unit, the origin and the part of the sweep that has returns."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from segslam.scans.dataset import Cloud, times_of
+from segslam.scans.dataset import Cloud, make_scan
 from segslam.scans.scan_files import sweep_times
 
 SHARES = np.linspace(0.125, 0.875, 7)  # nothing is seen in the first and the last eighth of the turn
@@ -49,10 +51,9 @@ def test_times_of_points_without_return_do_not_matter(invalid: float) -> None:
     points[[2, 5]] = [[np.nan, 1.0, 1.0], [0.0, 0.0, 0.0]]
     stamp_s = 1.7e9
     times = stamp_s + 0.1 * np.linspace(0.0, 0.999, 8)
-    expected = times_of(Cloud(points, times), round(1e9 * stamp_s))
+    labels = np.zeros(8, np.uint8)
+    expected = make_scan(Path("0.bin"), 0, round(1e9 * stamp_s), Cloud(points, times), labels).times
     times[[2, 5]] = invalid
-    found = times_of(Cloud(points, times), round(1e9 * stamp_s))
-    kept = [0, 1, 3, 4, 6, 7]
-    np.testing.assert_array_equal(found[kept], expected[kept])
-    np.testing.assert_allclose(found[kept], np.linspace(0.0, 0.999, 8)[kept], atol=1e-5)
-    assert np.isfinite(found).all()
+    found = make_scan(Path("0.bin"), 0, round(1e9 * stamp_s), Cloud(points, times), labels).times
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_allclose(found, np.linspace(0.0, 0.999, 8)[[0, 1, 3, 4, 6, 7]], atol=1e-5)

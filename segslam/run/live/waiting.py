@@ -13,7 +13,7 @@ import numpy as np
 
 from segslam.core.types import BadScan, Scan, Transform
 from segslam.odometry.motion_model import LONG_GAP
-from segslam.scans.dataset import Cloud, make_scan, times_of
+from segslam.scans.dataset import Cloud, make_scan
 
 MOST_WAITING = 4
 """Chosen: at 10 Hz, waiting then adds at most 0.4 s to the latency."""
@@ -185,9 +185,8 @@ class Source:
             file,
             index,
             stamp_ns,
-            cloud.points,
+            cloud,
             np.zeros(len(cloud.points), np.uint8),
-            times_of(cloud, cloud.stamp_ns or stamp_ns),
-            intensities=cloud.intensities if self._has_intensities else None,
+            has_intensities=self._has_intensities,
             vertical_angle_deg=self._vertical_angle_deg,
         )

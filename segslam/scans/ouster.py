@@ -81,10 +81,6 @@ class _Sensor:
     def header_bytes(self) -> int:
         return 0 if self.profile == "LEGACY" else HEADER_BYTES
 
-    @property
-    def packet_bytes(self) -> int:
-        return 2 * self.header_bytes + self.columns_per_packet * self.column_dtype.itemsize
-
     def __post_init__(self) -> None:
         """Raises ValueError for values that no sensor has."""
         numbers = (self.altitude_rad, self.azimuth_rad, self.T_sensor_lidar_mm, np.array(self.beam_origin_mm))
@@ -138,8 +134,8 @@ class OusterFrames:
         sensor = self._sensor
         frames: list[list[list[slice]]] = []
         last = sensor.columns_per_frame
-        payloads = udp_payloads(self._content, num_bytes=sensor.packet_bytes, port=sensor.port)
-        for payload in payloads:
+        num_bytes = 2 * sensor.header_bytes + sensor.columns_per_packet * sensor.column_dtype.itemsize
+        for payload in udp_payloads(self._content, num_bytes=num_bytes, port=sensor.port):
             number = int(self._columns(payload)["measurement"][0])
             if not frames or last - number > sensor.columns_per_frame // 2:
                 frames.append([])

@@ -44,7 +44,9 @@ def convert(
     """
     if (calib is None) != (to is None):
         raise SegslamError("--calib and --to-frame belong together: the calibration, and camera or lidar")
-    poses = _with_stamps(_read(source, source_format), source, times)
+    kind: FileFormat | None = source_format or ("csv" if source.suffix.lower() == ".csv" else None)
+    read = read_poses(source, format="tum" if kind == "csv" else kind, skips_names=kind == "csv")
+    poses = _with_stamps(read, source, times)
     if calib is not None:
         T_camera_lidar = read_calibration(calib)
         moved = lidar_from_camera if to == "lidar" else camera_from_lidar
@@ -66,13 +68,6 @@ def write_csv(path: Path, stamp_ns: Indices, T_a_b: Poses) -> None:
     """Write a line of column names, then the columns of TUM format with commas; stamps to the nanosecond."""
     write_tum(path, stamp_ns, T_a_b)
     path.write_text(f"{HEADER}\n{path.read_text(encoding='ascii').replace(' ', ',')}", encoding="ascii")
-
-
-def _read(source: Path, kind: FileFormat | None) -> PoseFile:
-    """The poses of a file; a line of column names at the start of a CSV file is not read."""
-    if kind == "csv" or (kind is None and source.suffix.lower() == ".csv"):
-        return read_poses(source, format="tum", skips_names=True)
-    return read_poses(source, format=kind)
 
 
 def _with_stamps(poses: PoseFile, source: Path, times: Path | None) -> PoseFile:

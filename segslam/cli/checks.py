@@ -70,7 +70,7 @@ def check_not_read(folder: Path, inputs: Iterable[Path | None]) -> None:
 
 def _holds(folder: Path, path: Path) -> bool:
     """True if a path is a folder or lies in it, whatever links there are."""
-    return folder.resolve() in (path.resolve(), *path.resolve().parents)
+    return path.resolve().is_relative_to(folder.resolve())
 
 
 def make_folder(
@@ -111,11 +111,8 @@ def make_folder(
 
 def check_links(folder: Path) -> None:
     """Raises SegslamError if a file in the folder of a run is a link to outside: writing it would write there."""
-    if not folder.is_dir():
-        return
-    inside = folder.resolve()
-    for file in folder.iterdir():
-        if file.is_symlink() and inside not in file.resolve().parents:
+    for file in folder.iterdir() if folder.is_dir() else ():
+        if file.is_symlink() and outside([file], folder):
             raise SegslamError(f"{file}: a link to {file.resolve()}, outside of the run; remove the link")
 
 

@@ -17,7 +17,7 @@ from matplotlib.ticker import LogFormatter
 from segslam.core.evaluation import align_positions, false_loops, pose_errors
 from segslam.core.trajectory import Poses, rows_of_same_scan, travelled_m
 from segslam.core.types import Indices, MotionState, Rejected, RejectReason
-from segslam.output.accuracy import judged_closures
+from segslam.output.accuracy import aligned_by, judged_closures
 from segslam.output.finished import FinishedRun
 
 # Okabe and Ito's colours, distinguishable with any colour vision
@@ -133,8 +133,7 @@ def draw_errors(run: FinishedRun) -> str | None:
     figure = Figure(figsize=(WIDTH_IN, 5.4), layout="constrained")
     whole, height = figure.subplots(2, 1, sharex=True)
     for line in _estimates_of(run):
-        estimate = line.poses[rows]
-        aligned = align_positions(estimate[:, :3, 3], truth[:, :3, 3]) @ estimate
+        aligned = aligned_by(line.poses[rows], truth, "se3")
         is_repaired = line.name == "odometry" and run.result.alone is not None
         plot_error(whole, f"{line.name}{' after repairs' * is_repaired}", aligned, truth, line.color)
         height.plot(travelled_m(truth), (aligned - truth)[:, 2, 3], color=line.color, linewidth=1.4)

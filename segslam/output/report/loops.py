@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from segslam.core import geometry
-from segslam.core.evaluation import align_positions, pose_errors
+from segslam.core.evaluation import pose_errors
 from segslam.core.trajectory import Poses
 from segslam.core.types import (
     GROUND_LABELS,
@@ -31,6 +31,7 @@ from segslam.core.types import (
     RejectReason,
     Transform,
 )
+from segslam.output.accuracy import aligned_by
 from segslam.output.finished import FinishedRun
 from segslam.output.map.from_above import png
 from segslam.output.report.figures import paths_of, true_scans
@@ -106,9 +107,9 @@ def _values(run: FinishedRun) -> dict[str, list[float]]:
     }
     true = true_scans(run)
     if true is not None and len(true[0]) == len(trajectory):
-        made, truth = trajectory.T_world_lidar[true[0]], true[1]
-        T_true_made = align_positions(made[:, :3, 3], truth[:, :3, 3])
-        values["error (m)"] = pose_errors(T_true_made @ made, truth).translation_m
+        rows, truth = true
+        aligned = aligned_by(trajectory.T_world_lidar[rows], truth, "se3")
+        values["error (m)"] = pose_errors(aligned, truth).translation_m
     return {name: _rounded(_thinned(of_scans)) for name, of_scans in values.items()}
 
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from segslam.bench.experiments.baselines import Estimate
-from segslam.bench.experiments.meter import Cost, measured
-from segslam.bench.experiments.methods import METHODS, Parts, prepare_parts
+from segslam.bench.experiments.methods import METHODS, Cost, Parts, measured, prepare_parts
 from segslam.bench.experiments.pairs import ScanVariant, Trial
 from segslam.bench.experiments.rows import Row
 from segslam.core import geometry

@@ -1,22 +1,41 @@
-"""All registration methods behind one interface: the data they need per scan, and how they align two scans."""
+"""All registration methods behind one interface: the data they need per scan, their alignment of two, and its cost."""
 
 import importlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter, process_time
 from typing import Any
 
 from segslam import verification as registration
 from segslam.bench.experiments import baselines
 from segslam.bench.experiments.baselines import Estimate
-from segslam.bench.experiments.meter import Cost, measured
 from segslam.bench.experiments.method_settings import check_method, method_config
 from segslam.core.config import Config, RefineConfig
 from segslam.core.extras import how_to_install
+from segslam.core.memory import give_back, status_mb
 from segslam.core.threads import Stopwatch
 from segslam.core.types import Alignment, Description, Labels, Points, Registration, Rejected, SegslamError
 from segslam.registration import refinement, segregator
 from segslam.registration.free_space import FreeSpace, observe_free_space
 from segslam.registration.prepared import PreparedScan
+
+CLEAR_REFS = Path("/proc/self/clear_refs")
+RESET_PEAK = "5"
+"""Value that, written to `clear_refs`, resets the peak memory to the current memory (Linux, proc(5))."""
+
+
+@dataclass(slots=True)
+class Cost:
+    """Time and memory; the fields are set when the measured block ends."""
+
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    """CPU time of all threads; more reliable than `seconds` on a busy machine."""
+    peak_mb: float | None = None
+    """Peak of additional memory; None if unknown. Invalid while other threads of the process work."""
+
 
 Values = Mapping[str, Any]
 """The parts of one scan by name."""
@@ -66,6 +85,22 @@ PARTS: dict[str, Callable[[Points, Labels, Config], Any]] = {
     "points": lambda points, *_: points.astype("float32"),
 }
 """The parts by name, from points, labels and configuration."""
+
+
+@contextmanager
+def measured() -> Iterator[Cost]:
+    """Context manager that yields the cost of its block."""
+    cost = Cost()
+    give_back()
+    before_mb = None
+    with suppress(OSError):
+        CLEAR_REFS.write_text(RESET_PEAK)
+        before_mb = status_mb("VmRSS")
+    started, cpu_started = perf_counter(), process_time()
+    yield cost
+    cost.seconds, cost.cpu_seconds = perf_counter() - started, process_time() - cpu_started
+    if before_mb is not None:
+        cost.peak_mb = max((status_mb("VmHWM") or 0.0) - before_mb, 0.0)
 
 
 def prepare_parts(points: Points, labels: Labels, *, methods: Iterable[str], config: Config) -> Parts:

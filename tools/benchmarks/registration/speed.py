@@ -8,7 +8,7 @@ from time import perf_counter, process_time
 import numpy as np
 
 from segslam.bench.experiments.baselines import align_gicp, prepare_gicp
-from segslam.bench.experiments.meter import measured
+from segslam.bench.experiments.methods import measured
 from segslam.bench.experiments.pairs import Trial
 from segslam.core.config import Config
 from segslam.core.types import Description, Label, Registration

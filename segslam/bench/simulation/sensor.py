@@ -94,6 +94,9 @@ INTENSITY = {
     Label.VEGETATION: (0.33, 0.13), Label.TRUNK: (0.31, 0.14), Label.TERRAIN: (0.31, 0.12), Label.POLE: (0.20, 0.17),
     Label.TRAFFIC_SIGN: (0.6, 0.25), Label.MOVING_CAR: (0.15, 0.18),
 }  # fmt: skip
+MEAN_INTENSITY, SPREAD_INTENSITY = np.array(
+    [INTENSITY.get(label, INTENSITY[Label.UNLABELLED]) for label in Label], dtype=np.float32
+).T
 SIGNAL = 35.0  # chosen: a road (reflectivity 0.2, normal incidence) is visible up to 50 m, as in real scans
 GLASS_PASSES = 0.6  # chosen: share of the rays that a car window does not return
 
@@ -182,13 +185,6 @@ def _intensity(labels: Labels, rng: np.random.Generator) -> Vector:
     """Intensities by class, 0 to 0.99 in steps of 0.01."""
     drawn = MEAN_INTENSITY[labels] + SPREAD_INTENSITY[labels] * rng.standard_normal(len(labels), dtype=np.float32)
     return np.round(np.clip(drawn, 0.0, 0.99), 2)
-
-
-def _table(column: int) -> Vector:
-    return np.array([INTENSITY.get(label, INTENSITY[Label.UNLABELLED])[column] for label in Label], dtype=np.float32)
-
-
-MEAN_INTENSITY, SPREAD_INTENSITY = _table(0), _table(1)
 
 
 def drive_sweeps(

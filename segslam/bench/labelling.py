@@ -4,7 +4,6 @@ Scores are intersections over unions (IoU) as in SemanticKITTI (Behley et al., I
 class count; moving classes count as their static class.
 """
 
-import io
 import logging
 from collections.abc import Iterable
 from pathlib import Path
@@ -26,6 +25,7 @@ from segslam.labels.label_files import computed, write_labels
 from segslam.labels.network_settings import ImageSettings
 from segslam.labels.range_image import EMPTY, project
 from segslam.output.folder import write_csv
+from segslam.output.map.from_above import png
 from segslam.scans import Dataset
 
 logger = logging.getLogger(__name__)
@@ -142,9 +142,7 @@ def draw_labels(points: Points, labels: Labels, *, truth: Labels | None, image: 
         square.imshow(_from_above(points, colors), extent=(REACH_M, -REACH_M, -REACH_M, REACH_M))
         square.set(title=f"top view, {name}", xlabel="y, left (m)", ylabel="x, ahead (m)")
     legend.legend(handles=_legend(labels, truth), loc="center", ncols=7, frameon=False)
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=100)
-    return content.getvalue()
+    return png(figure)
 
 
 def fitting_image(points: Points) -> ImageSettings:

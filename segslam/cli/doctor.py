@@ -118,7 +118,6 @@ def _loads(library: str) -> bool:
 
 
 def _memory_gb() -> dict[str, float]:
-    """Total and available memory of the machine."""
     text = Path("/proc/meminfo").read_text(encoding="ascii")
     kilobytes = dict(re.findall(r"^(\w+):\s+(\d+) kB$", text, re.MULTILINE))
     return {"total": int(kilobytes["MemTotal"]) / 2**20, "available": int(kilobytes["MemAvailable"]) / 2**20}

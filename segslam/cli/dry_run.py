@@ -81,7 +81,6 @@ def first_usable(scans: "Dataset", *, backwards: bool = False) -> "tuple[int, Sc
 
 
 def _labels(scans: "Dataset") -> str:
-    """Source of the labels, as text."""
     source = scans.labels
     if source.network is not None:
         return "by network, for keyframes"

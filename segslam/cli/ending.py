@@ -129,7 +129,6 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
 
 
 def _adjustment(metrics: dict[str, Any]) -> str:
-    """A line about the adjustment of the whole map."""
     line = (
         f"whole map adjusted by {counted(metrics['num_submap_pairs'], 'pair')} of submaps: keyframes moved by "
         f"{metrics['adjustment_moved_m']:.2f} m (rms)"

@@ -298,6 +298,5 @@ def _status(terminal: Terminal) -> Iterator[tuple[Callable[[str], object], float
 
 
 def _spread(values: list[float]) -> dict[str, float]:
-    """Median, 95th percentile and maximum."""
     ordered = sorted(values)
     return {"median": median(ordered), "p95": ordered[int(0.95 * (len(ordered) - 1))], "max": ordered[-1]}

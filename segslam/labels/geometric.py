@@ -97,7 +97,6 @@ def geometric_labels(points: Points) -> Labels:
 
 
 def _poles(points: Points, heights: Vector) -> Found:
-    """Thin vertical objects."""
     thin = on_thin_uprights(points, heights)
     found = pieces(points[thin], heights[thin], np.full(thin.sum(), True))
     thin[thin] = _most_seen(found, np.full(len(found.top_m), True))[found.of_point]

@@ -43,7 +43,6 @@ def loops_section(loops: Mapping[str, bytes]) -> str:
 
 
 def _files(run: FinishedRun) -> str:
-    """Links to the existing files beside the page."""
     there = {name: text for name, text in FILES.items() if (run.folder / name).is_file()}
     return table((f'<a href="{name}">{name}</a>', text) for name, text in there.items())
 

@@ -37,17 +37,10 @@ class Tally(ctypes.Structure):
         ("num_arrived", ctypes.c_int64),
         ("num_dropped", ctypes.c_int64),
         ("num_gaps", ctypes.c_int64),
-        ("num_missing", ctypes.c_int64),
+        ("num_missing", ctypes.c_int64),  # estimated from the length of the gaps
         ("num_clock_set", ctypes.c_int64),
         ("longest_gap_s", ctypes.c_double),
     )
-    num_arrived: int
-    num_dropped: int
-    num_gaps: int
-    num_missing: int
-    """Number of missing scans, estimated from the length of the gaps."""
-    num_clock_set: int
-    longest_gap_s: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

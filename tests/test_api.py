@@ -182,6 +182,7 @@ WRONG_KINDS = {
     "segslam.map_folder('.', None)": "None: not a path",
     "segslam.read_run(5)": "5: not a path",
     "segslam.replay(5, 'run')": "5: not a path",
+    "segslam.merge(5, 'run')": "5: not a path",
     "segslam.merge(['.', 5], 'run')": "5: not a path",
     "segslam.report(None)": "None: not a path",
     "segslam.export(5, 'map.ply')": "5: not a path",

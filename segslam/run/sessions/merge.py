@@ -1,7 +1,7 @@
 """Merging of several finished runs into one: one graph, one map, one log."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice, product
@@ -178,7 +178,8 @@ def merge(
     run, if one did not finish, is damaged, is given twice or was not found in any other.
     """
     check_config(config)
-    sessions = read_sessions([expanded(run) for run in ([runs] if isinstance(runs, str | Path) else runs)])
+    several = runs if isinstance(runs, Iterable) and not isinstance(runs, str) else [runs]
+    sessions = read_sessions([expanded(run) for run in several])
     config = config or sessions[0].run.config
     merged = plan(sessions, config=config, same_reference=same_reference)
     return write_merged(merged, new_folder(expanded(out)), config, on_step=on_step)

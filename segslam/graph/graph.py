@@ -174,7 +174,7 @@ class PoseGraph:
             edge = Edge(keyframe_id - 1, keyframe_id, T_last_new, known)
             self._has_own_information.append(information is not None)
             self._has_breaks |= is_break(edge)  # also where loops show that the odometry errs more
-            num_breaks = self.num_breaks[-1] + (information is not None and is_break(edge))
+            num_breaks = int(self.num_breaks[-1]) + (information is not None and is_break(edge))
             self._odometry.append(edge)
             self._rejected.append(False)
             self._backbone.add(edge.factor())

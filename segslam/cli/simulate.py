@@ -88,7 +88,8 @@ def simulate(
                 if interrupts:
                     break
     except KeyboardInterrupt:
-        when_stopped(f"{counted(last, 'scan')} complete in {out / 'sequences' / sequence}; {begin_again}")
+        are_complete = f"{counted(last, 'scan')} {'is' if last == 1 else 'are'} complete"
+        when_stopped(f"{are_complete} in {out / 'sequences' / sequence}; {begin_again}")
         raise
     folder, true_poses = out / "sequences" / sequence, out / "poses" / f"{sequence}.txt"
     figures = {"num_scans": last, "sequence": str(folder), "poses": str(true_poses)}

@@ -16,6 +16,7 @@ from segslam.core.types import Alignment, GraphEstimate, LoopClosure, Placement,
 from segslam.graph import AnchoredGraph, PoseGraph, noise
 from segslam.graph.edges import Edge, factor_graph, squared_errors
 from segslam.graph.g2o import read_g2o
+from segslam.graph.graph import BREAK_LENGTH_M
 from segslam.graph.levenberg_marquardt import Unsolvable
 from segslam.graph.noise import closure_information, inlier_bound, odometry_information
 
@@ -521,6 +522,15 @@ def test_a_drift_whose_correction_cannot_be_solved_leaves_the_solution(monkeypat
     estimate = graph.finish()
     assert len(calls) == 2
     np.testing.assert_allclose(estimate.T_world_keyframe[39], truth[39], atol=1e-3)
+
+
+def test_a_drive_in_a_map_has_the_breaks_and_the_travel_of_its_keyframes() -> None:
+    graph = AnchoredGraph(CONFIG)
+    for number in range(4):
+        T_odom = geometry.transform(np.eye(3), [2.0 * number, 0.0, 0.0])
+        graph.add_keyframe(number, T_odom, 2.0 * number, information=np.zeros((6, 6)) if number == 2 else None)
+    assert graph.num_breaks.tolist() == [1, 1, 2, 2]
+    np.testing.assert_allclose(np.diff(graph.travel_m), [2.0, 2.0 + BREAK_LENGTH_M, 2.0])
 
 
 def test_placements_in_a_map_have_the_weights_of_their_keyframes() -> None:

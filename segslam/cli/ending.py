@@ -15,11 +15,12 @@ if TYPE_CHECKING:
     from segslam.slam.slam_result import SlamResult
 
 TROUBLE = (
-    ("num_scans_skipped", "scan", "{} skipped (unreadable, empty or without a pose); see the warning above"),
+    ("num_scans_skipped", "scan", "{} skipped (unreadable, empty, late or without a pose); see the warning above"),
     (
         "num_scans_late",
         "scan",
-        "{} skipped: a scan before has the same stamp or a later one; correct the stamps, or a clock that was set back",
+        "of these, {} skipped: a scan before has the same stamp or a later one; correct the stamps, or a clock that "
+        "was set back",
     ),
     ("num_motions_repaired", "motion", "odometry: {} repaired by registration with earlier scans"),
     ("num_motions_broken", "break", "odometry: {}, i.e. motions not supported by the scans; see the report"),

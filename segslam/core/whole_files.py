@@ -1,7 +1,7 @@
 """Paths as users give them, their texts, and atomic writing: a file appears when it is complete, or not at all."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from secrets import token_hex
@@ -18,6 +18,12 @@ def expanded(path: str | Path) -> Path:
         raise SegslamError(f"{brief(str(path))}: there is no user with this name; write the folder in full") from error
     except TypeError as error:
         raise SegslamError(f"{brief(repr(path))}: not a path; give a text or a Path") from error
+
+
+def all_expanded(paths: str | Path | Iterable[str | Path]) -> list[Path]:
+    """One path or several, each as by `expanded`."""
+    each = paths if isinstance(paths, Iterable) and not isinstance(paths, str) else [paths]
+    return [expanded(path) for path in each]
 
 
 def read_text(path: Path, content: str, remedy: str) -> str:

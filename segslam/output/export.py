@@ -1,7 +1,7 @@
 """A finished run, written to files: its map, and its trajectory and origin on the globe (GeoJSON, KML, GPX, YAML)."""
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -14,7 +14,7 @@ import numpy as np
 
 from segslam.core.config import MapConfig, load_config
 from segslam.core.types import GraphEstimate, Indices, Keyframe, Mask, SegslamError, Trajectory, Transform
-from segslam.core.whole_files import cannot_write, expanded, whole_file
+from segslam.core.whole_files import all_expanded, cannot_write, expanded, whole_file
 from segslam.output.finished import read_corrections
 from segslam.output.folder import PLACE_ON_GLOBE, read_localised
 from segslam.output.log import RunLog, read_log
@@ -46,8 +46,7 @@ def export(
     """
     log = read_log(expanded(run))
     config = load_config(None, settings, base=log.config).map
-    several = files if isinstance(files, Iterable) and not isinstance(files, str) else [files]
-    return write_maps(log, [expanded(file) for file in several], config=config)
+    return write_maps(log, all_expanded(files), config=config)
 
 
 def write_maps(

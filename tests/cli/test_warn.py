@@ -44,4 +44,4 @@ def test_many_bad_scans_make_two_lines(tmp_path: Path) -> None:
     assert len(output) == 2
     assert "scan 1" in output[0]
     assert output[1].startswith("segslam: 4 more warnings like this, the last: scan 5")
-    assert "5 scans skipped (unreadable, empty or without a pose)" in done.stderr
+    assert "5 scans skipped (unreadable, empty, late or without a pose)" in done.stderr

@@ -79,7 +79,7 @@ def test_scans_after_a_clock_was_set_back_are_counted_and_the_summary_names_the_
     assert [isinstance(step, BadScan) for step in steps] == [False] * 3 + [True] * 3
     assert (metrics["num_scans"], metrics["num_scans_skipped"], metrics["num_scans_late"]) == (3, 3, 3)
     said = summary(metrics, tmp_path / "run")
-    assert "3 scans skipped: a scan before has the same stamp or a later one; correct the stamps" in said
+    assert "of these, 3 scans skipped: a scan before has the same stamp or a later one; correct the stamps" in said
 
 
 @pytest.mark.parametrize("is_finished", [False, True])

@@ -57,7 +57,7 @@ class FolderSource(Source):
         there = [entry for entry in self._folder.iterdir() if entry.suffix.lower() in SUFFIXES]
         self._has_missed = self._noted_ns.value > 0
         if there and not self._has_missed:
-            tell(f"{counted(len(there), 'scan')} already in {self._folder} ignored; use segslam map for all scans")
+            tell(f"ignored: {counted(len(there), 'scan')} already in {self._folder}; use segslam map for all scans")
         self._noted_ns.value = self._noted_ns.value or time_ns()
 
     def feed(self, waiting: Waiting, stopped: Event) -> str:

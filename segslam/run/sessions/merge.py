@@ -1,7 +1,7 @@
 """Merging of several finished runs into one: one graph, one map, one log."""
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import islice, product
@@ -13,7 +13,7 @@ from segslam.candidates.places import OTHER_PLACE_M
 from segslam.core import geometry
 from segslam.core.config import Config, check_config
 from segslam.core.types import LoopAttempt, SegslamError, Step, Trajectory
-from segslam.core.whole_files import expanded
+from segslam.core.whole_files import all_expanded, expanded
 from segslam.gnss import Use
 from segslam.gnss.fixes import Row
 from segslam.output.finished import FinishedRun, read_run
@@ -178,8 +178,7 @@ def merge(
     run, if one did not finish, is damaged, is given twice or was not found in any other.
     """
     check_config(config)
-    several = runs if isinstance(runs, Iterable) and not isinstance(runs, str) else [runs]
-    sessions = read_sessions([expanded(run) for run in several])
+    sessions = read_sessions(all_expanded(runs))
     config = config or sessions[0].run.config
     merged = plan(sessions, config=config, same_reference=same_reference)
     return write_merged(merged, new_folder(expanded(out)), config, on_step=on_step)

@@ -134,7 +134,7 @@ class Placer:
         return self._contradiction(earlier, later.keyframe_id, later.T_world_keyframe) is None
 
     def _is_tracked(self, earlier_id: int, later_id: int) -> bool:
-        """True if no break lies between two keyframes."""
+        """True if no break separates two keyframes."""
         return bool(self._graph.num_breaks[earlier_id] == self._graph.num_breaks[later_id])
 
     def _contradiction(self, earlier: Placement, keyframe_id: int, T_world_keyframe: Transform) -> Rejected | None:

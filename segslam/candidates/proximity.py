@@ -14,10 +14,11 @@ from scipy.special import ndtr, ndtri
 from segslam.candidates.places import SAME_PLACE_M
 from segslam.core import geometry
 from segslam.core.config import ProximityConfig
+from segslam.core.probabilities import INLIER_PROBABILITY
 from segslam.core.types import REJECTED_WEIGHT, IndexPairs, Indices, LoopCandidate, LoopClosure, Vector
 
-LEAST_PROBABILITY = 0.01
-"""Chosen: two keyframes that are near each other with a smaller probability are no candidate."""
+LEAST_PROBABILITY = 1.0 - INLIER_PROBABILITY
+"""Two keyframes that are near each other with a smaller probability are no candidate."""
 FARTHEST = float(-ndtri(LEAST_PROBABILITY / 2.0))
 """An error of more standard deviations has a smaller probability than that."""
 HEIGHT_M = 1.0

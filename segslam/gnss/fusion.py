@@ -11,7 +11,9 @@ without fixes: the solution is used there, too, and between fixes that are near 
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.special import ndtri
 
+from segslam.core.probabilities import SIGNIFICANT
 from segslam.core.trajectory import Poses, travelled_m
 from segslam.core.types import Mask, Points, SegslamError, Vector
 from segslam.gnss.alignment import Placement, antennas, moved, refined
@@ -33,8 +35,8 @@ LEAST_FUSED = 24
 """Chosen: with fewer fixes, four a window, the drive keeps its shape."""
 ROUNDS = 4
 """Chosen: iterations of weights and poses; they settle in three."""
-SIGNIFICANT = 4.0
-"""Chosen: the clock and the lever arm are corrected beyond this many standard deviations."""
+SIGNIFICANT_SIGMAS = float(-ndtri(0.5 * SIGNIFICANT))
+"""The clock and the lever arm are corrected beyond this many standard deviations."""
 CONSTANT_ROUNDS = 3
 """Chosen: repetitions of placement and constants; the third changes the lever arm by less than its noise."""
 
@@ -56,8 +58,8 @@ def calibrate(
         found = estimated(graph, placement, axis=0, free=(clock_free, arm_free))
         clock, arm = found.constants[6], found.constants[7:9]
         total_s, total_m = abs(measured_s + clock), np.abs(arm_m[:2] + arm)
-        clock_free = clock_free and bool(total_s > SIGNIFICANT * found.constant_sigma[6])
-        arm_free = arm_free and bool((total_m > SIGNIFICANT * found.constant_sigma[7:9]).any())
+        clock_free = clock_free and bool(total_s > SIGNIFICANT_SIGMAS * found.constant_sigma[6])
+        arm_free = arm_free and bool((total_m > SIGNIFICANT_SIGMAS * found.constant_sigma[7:9]).any())
         measured_s = measured_s + float(clock) if clock_free else 0.0
         arm_m = arm_m + np.array([*arm, 0.0]) if arm_free else np.zeros(3)
         start = moved(placement.T_enu_map, found.constants[:6])

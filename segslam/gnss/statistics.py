@@ -6,7 +6,9 @@ drive from a correct fix into the run, and out of it, contradicts them.
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import chdtri
 
+from segslam.core.probabilities import SIGNIFICANT
 from segslam.core.types import Mask, Points, Vector
 
 Weights = Float[np.ndarray, "_ 2"]
@@ -27,8 +29,8 @@ KEPT_WEIGHT = 0.25
 """A fix is kept if its weight is that of a residual within three standard deviations, or more."""
 DRIFT = 0.02
 """Chosen: share of the travel by which the drive may have drifted; odometry drifts by 1 or 2 %."""
-BOUND = 3.5
-"""Chosen: two fixes are consistent within this many standard deviations of their difference."""
+BOUND = float(np.sqrt(chdtri(2, SIGNIFICANT)))
+"""Two fixes are consistent within this many standard deviations of their difference, which has two components."""
 
 
 def axis_sigma(residual_m: np.ndarray) -> float:

@@ -67,7 +67,7 @@ def optimize_graph(graph: G2oGraph, *, robust: Robust = "consistent") -> Optimiz
     Edges between consecutive ids count as odometry and are always kept, unless several between the same two contradict
     each other: then they are closures, too. All others are closures: kept (`none`), under a robust kernel, or kept or
     rejected by graduated non-convexity (`gnc`) or starting from a pairwise-consistent set (`consistent`). The bound of
-    inliers is a chi-square that all of them are below with `noise.INLIER_PROBABILITY`.
+    inliers is a chi-square that all of them are below with `INLIER_PROBABILITY`.
     If odometry alone does not connect the graph, `gnc` raises SegslamError, and `consistent` falls back to `cauchy`.
     """
     problem = FileProblem.of(graph)

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from segslam.core import geometry
+from segslam.core.probabilities import INLIER_PROBABILITY, SIGNIFICANT
 from segslam.core.types import Mask
 from segslam.graph import gnc, noise
 from segslam.graph.closure_pairs import MAX_PAIRED, adjoints, consistent_pairs, largest_consistent, neighbours
@@ -46,7 +47,7 @@ class FileProblem:
     contradicting: list[list[Edge]]
     """Edges between the same neighbours that contradict each other."""
     inlier_bound: float
-    """Chi-square that all closures, if all are inliers, are below with `noise.INLIER_PROBABILITY`."""
+    """Chi-square that all closures, if all are inliers, are below with `INLIER_PROBABILITY`."""
 
     @classmethod
     def of(cls, graph: G2oGraph) -> "FileProblem":
@@ -56,7 +57,7 @@ class FileProblem:
         odometry = [edge for edge in graph.edges if abs(edge.a - edge.b) == 1 and id(edge) not in moved]
         odometry += [replace(edges[0], information=noise.UNKNOWN_MOTION) for edges in groups]
         closures = [edge for edge in graph.edges if abs(edge.a - edge.b) != 1 or id(edge) in moved]
-        each = 1.0 - (1.0 - noise.INLIER_PROBABILITY) / max(1, len(closures))
+        each = 1.0 - (1.0 - INLIER_PROBABILITY) / max(1, len(closures))
         num_fixed = max(1, len(set(graph.fixed)))
         return cls(len(graph.T_world_vertex), num_fixed, odometry, closures, groups, noise.inlier_bound(each))
 
@@ -159,7 +160,7 @@ def contradicting(odometry: Sequence[Edge]) -> list[list[Edge]]:
     same: dict[int, list[Edge]] = defaultdict(list)
     for edge in odometry:
         same[min(edge.a, edge.b)].append(edge)
-    bound = noise.inlier_bound(1.0 - noise.SIGNIFICANT)
+    bound = noise.inlier_bound(1.0 - SIGNIFICANT)
     return [edges for edges in same.values() if any(_chi2(one, other) > bound for one, other in combinations(edges, 2))]
 
 

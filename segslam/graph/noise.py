@@ -8,6 +8,7 @@ from scipy.special import chdtri
 
 from segslam.core import geometry
 from segslam.core.config import GraphConfig
+from segslam.core.probabilities import INLIER_PROBABILITY
 from segslam.core.types import Information, Tangent, Transform
 from segslam.graph.edges import Kernel
 
@@ -17,16 +18,6 @@ CLOSURE_SIGMA_M = 0.04
 """Measured (simulated 06): smallest translation noise of a closure (m)."""
 CLOSURE_SIGMA_DEG = 0.08
 """Measured (simulated 06): smallest rotation noise of a closure (degrees)."""
-INLIER_PROBABILITY = 0.99
-"""Statistics: a closure is an inlier if its squared error is below this quantile of the chi-square distribution (6
-degrees of freedom)."""
-
-SIGNIFICANT = 0.001
-"""Chosen: what is less probable is excluded. An odometry of other sensors is overruled where its pose is less likely,
-given the scans; KISS-ICP is off where chance explains its distance from a registration with less; a pose has a good
-score if its odds of being wrong are less; two edges of a file contradict each other if chance explains their difference
-with less. The adjustment has the same share of chance for a sweep that scans show, for surfaces that become thicker,
-and for a pose out of reach of an alignment."""
 
 DEGREES_OF_FREEDOM = 6
 FIRST_POSE_SIGMA = 1e-4  # chosen (rad, m): holds the world in place, far below any other noise and above rounding

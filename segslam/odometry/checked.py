@@ -22,9 +22,10 @@ from scipy.stats import chi2
 
 from segslam.core import geometry
 from segslam.core.config import Config
+from segslam.core.probabilities import SIGNIFICANT
 from segslam.core.types import Information, Motion, MotionState, Scan, Transform
 from segslam.graph.edges import BREAK_M
-from segslam.graph.noise import SIGNIFICANT, odometry_information
+from segslam.graph.noise import odometry_information
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, is_usual

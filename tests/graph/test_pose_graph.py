@@ -418,7 +418,7 @@ def test_gnc_agrees_with_gtsams_own(tmp_path: Path) -> None:
     parameters = gtsam.GncLMParams()
     parameters.setKnownInliers(list(range(120)))
     optimizer = gtsam.GncLMOptimizer(factors, values, parameters)
-    bound = inlier_bound(noise.INLIER_PROBABILITY, error_allowance=CONFIG.error_allowance)
+    bound = inlier_bound(error_allowance=CONFIG.error_allowance)
     optimizer.setInlierCostThresholds(0.5 * bound)  # GTSAM bounds the error
     found = optimizer.optimize()
     weights = graph.finish().closure_weights

@@ -10,13 +10,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from segslam.candidates.places import OTHER_PLACE_M
-from segslam.candidates.proximity import Covariances
+from segslam.candidates.proximity import HEIGHT_M, Covariances
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.points import voxel_means
+from segslam.core.probabilities import SIGNIFICANT
 from segslam.core.trajectory import Poses
 from segslam.core.types import IndexPairs, Indices, Points, Transform, Vector
-from segslam.graph.noise import SIGNIFICANT
 from segslam.keyframes import is_known
 from segslam.registration.refinement import LightSurface, downsample
 from segslam.slam.adjustment.alignment import SEARCH_M, Alignment, PointsOf, align
@@ -29,8 +29,6 @@ EVERY = 2
 """Chosen on KITTI 00: a submap is registered for every n-th keyframe."""
 STEPS = (5, 10)
 """Chosen on KITTI 00: distances of registered submaps along the drive, in keyframes."""
-STOREY_M = 2.0
-"""Chosen: keyframes of two passes with a larger difference of heights may be on two storeys."""
 
 Aligned = Callable[[int, int, Transform], Alignment | None]
 """The alignment of a target and a source, by their ids, near an initial guess."""
@@ -104,7 +102,7 @@ def pairs_between_passes(T_world: Poses, travel_m: Vector, *, min_travel_m: floa
     for row, rows in enumerate(near):
         older = np.array(sorted(other for other in rows if other < row), dtype=np.int64)
         older = older[travel_m[nodes[row]] - travel_m[nodes[older]] >= min_travel_m]
-        older = older[np.abs(places[older, 2] - places[row, 2]) < STOREY_M]
+        older = older[np.abs(places[older, 2] - places[row, 2]) < HEIGHT_M]
         for one in np.split(older, 1 + np.flatnonzero(np.diff(travel_m[nodes[older]]) >= min_travel_m)):
             if len(one):
                 nearest = one[np.argmin(np.linalg.norm(places[one] - places[row], axis=1))]

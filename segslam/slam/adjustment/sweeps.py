@@ -18,9 +18,9 @@ from scipy.stats import t as student
 
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
+from segslam.core.probabilities import SIGNIFICANT
 from segslam.core.trajectory import Poses
 from segslam.core.types import Indices, Motion, Points, Tangent, Trajectory, Vector
-from segslam.graph.noise import SIGNIFICANT
 from segslam.registration.refinement import LightSurface, downsample
 from segslam.slam.adjustment.alignment import MOST_PAIRS, PointsOf, Shown, shown
 from segslam.slam.adjustment.submaps import STEPS

@@ -11,10 +11,10 @@ from scipy.stats import wilcoxon
 
 from segslam.core import geometry
 from segslam.core.points import cell_keys, group_moments, within_range
+from segslam.core.probabilities import SIGNIFICANT
 from segslam.core.processes import in_parts
 from segslam.core.trajectory import Poses
 from segslam.core.types import IndexPairs, Points, Transform, Vector
-from segslam.graph.noise import SIGNIFICANT
 
 CELL_M = 1.0
 """Chosen: edge of the cells that hold a patch; walls and roads are flat over it."""

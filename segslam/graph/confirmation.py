@@ -11,11 +11,10 @@ from itertools import compress
 from segslam.candidates.places import SAME_PLACE_M
 from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, RejectReason
 from segslam.graph import Graph
+from segslam.graph.motions import PLACE_M
 
 MIN_CONSISTENT = 3
 """Chosen: number of registrations of keyframes that must be consistent, of more than one place."""
-WAITING_M = 40.0
-"""Chosen: travel within which registrations confirm each other."""
 
 
 class Confirmation:
@@ -54,4 +53,4 @@ class Confirmation:
 
     def _near(self, keyframe_id: int) -> list[tuple[LoopCandidate, LoopClosure]]:
         travel_m = self._graph.travel_m
-        return [one for one in self._waiting if abs(travel_m[keyframe_id] - travel_m[one[1].source_id]) <= WAITING_M]
+        return [one for one in self._waiting if abs(travel_m[keyframe_id] - travel_m[one[1].source_id]) <= PLACE_M]

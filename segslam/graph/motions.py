@@ -25,7 +25,8 @@ from segslam.graph.edges import Edge, chained, factor_graph, joined, poses_by_id
 from segslam.graph.gnc import MIN_GROUP, select_consistent
 
 PLACE_M = 30.0
-"""Closures whose ends are this near in travel join the same two places, and may be wrong together. Chosen."""
+"""Closures whose ends are this near in travel join the same two places: they may be wrong together, and registrations
+that wait confirm each other. Chosen."""
 PLACE_PENALTY = 2.0
 """Closures joining the same two places are correlated; together they weigh at most as much as this many independent
 ones. Chosen from 0.5 to 5 with `tools/benchmarks/back_end`: below, correct closures are rejected; above, a repeated

@@ -51,8 +51,8 @@ ROUGHNESS_REACH, LEAST_ROUGHNESS = 1.6, 0.02
 """Chosen, in voxels: farther neighbours are on other surfaces; a roughness below the second value is rounding."""
 SETTLED_M, SETTLED_RAD = 0.02, math.radians(0.1)
 """Chosen: one in ten sparse scans oscillates by less between two sets of pairs."""
-SAME_START_M, SAME_START_RAD = 0.5, math.radians(2.0)
-"""Chosen: refinements from poses this near to each other end at the same pose."""
+SAME_POSE_M, SAME_POSE_RAD = 0.75, math.radians(5.0)
+"""Chosen: poses this near to each other are the same, and refinements from them end at one."""
 SPARSE_VOXELS, LEAST_SPARSE = 3.0, 500
 """Chosen: edge of the voxels of a sparse surface, in `voxel_m`, and the points that it has at least."""
 NUM_APPROACH = 5
@@ -227,8 +227,8 @@ def refine(
 
 
 def is_near(T_target_source: Transform, T_target_others: Sequence[Transform]) -> bool:
-    """True if refinement from a pose ends at the same one as from another of these."""
-    return geometry.is_near(T_target_source, T_target_others, within_m=SAME_START_M, within_rad=SAME_START_RAD)
+    """True if a pose is the same as another of these."""
+    return geometry.is_near(T_target_source, T_target_others, within_m=SAME_POSE_M, within_rad=SAME_POSE_RAD)
 
 
 def approach(source: Surface, target: Surface, T_target_source: Transform, *, config: RefineConfig) -> Transform:

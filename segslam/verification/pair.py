@@ -21,7 +21,7 @@ from segslam.core.types import (
 from segslam.labels import geometric_labels
 from segslam.registration import refinement
 from segslam.registration.prepared import PreparedScan, prepare_scan
-from segslam.verification.rivals import is_same, rivals_of
+from segslam.verification.rivals import rivals_of
 from segslam.verification.trial import MAX_COARSE_FINE_M, Found, Gate, Trial, anywhere, judged
 
 
@@ -102,7 +102,7 @@ def tried_poses(trial: Trial) -> list[Found] | Rejected:
             if isinstance(pose, Found) and trial.gate(pose.T_target_source, slack_m=0.0) is None
         ]
         best = max(allowed, key=lambda pose: pose.mean_ratio)
-    return [best, *(pose for pose in found if not is_same(pose.T_target_source, best.T_target_source))]
+    return [best, *(pose for pose in found if not refinement.is_near(pose.T_target_source, [best.T_target_source]))]
 
 
 def _outcome(trial: Trial, coarse: Registration, found: Sequence[Found]) -> Found | Rejected | None:
@@ -125,14 +125,14 @@ def register_near(
 ) -> Alignment | Rejected:
     """The refined and verified pose near a known one; no other poses are tried.
 
-    Rejects FAR_FROM_PRIOR if refinement leads to another pose (`is_same`).
+    Rejects FAR_FROM_PRIOR if refinement leads to another pose (`refinement.is_near`).
     """
     trial = Trial(source, target, config, anywhere, watch)
     with watch("refine"):
         fine = refinement.refine(source.surface, target.surface, T_target_source, config=config.refine)
     if isinstance(fine, Rejected):
         return fine
-    if not is_same(T_target_source, fine.T_target_source):
+    if not refinement.is_near(fine.T_target_source, [T_target_source]):
         moved = geometry.inverse(T_target_source) @ fine.T_target_source
         detail = f"moved {geometry.distance(moved):.2f} m, {math.degrees(geometry.angle(moved)):.1f} degrees"
         return Rejected(RejectReason.FAR_FROM_PRIOR, detail)

@@ -21,8 +21,6 @@ FEW_LEAD, APPROACH_LEAD = 2.0, 4.0
 than matters, after a refinement with few points and after its first iterations."""
 MOST_RIVALS = 4
 """Chosen: number of rivals that are refined with all points, those over which the found pose leads least."""
-SAME_POSE_M, SAME_POSE_RAD = 0.75, math.radians(5.0)
-"""Chosen: poses closer to each other than this are the same."""
 
 
 def rivals_of(found: Found, known: Sequence[Found], trial: Trial) -> list[Found]:
@@ -44,11 +42,6 @@ def rivals_of(found: Found, known: Sequence[Found], trial: Trial) -> list[Found]
     return [rival for rival in refined if isinstance(rival, Found)]
 
 
-def is_same(T_target_source: Transform, T_target_other: Transform) -> bool:
-    """True if two poses are so close that they are the same."""
-    return geometry.is_near(T_target_source, [T_target_other], within_m=SAME_POSE_M, within_rad=SAME_POSE_RAD)
-
-
 class _Start(NamedTuple):
     """A pose to which few points lead."""
 
@@ -65,7 +58,7 @@ def _starts(found: Found, trial: Trial) -> list[_Start]:
     return [
         start
         for start in (*shifted, *plans)
-        if start is not None and not is_same(start.coarse.T_target_source, found.T_target_source)
+        if start is not None and not refinement.is_near(start.coarse.T_target_source, [found.T_target_source])
     ]
 
 
@@ -76,7 +69,7 @@ def _led(coarse: Registration, found: Found, trial: Trial) -> _Start | None:
         return None
     with trial.watch("refine"):
         T_begun = refinement.approach(*surfaces, coarse.T_target_source, config=trial.config.refine)
-    if is_same(T_begun, found.T_target_source):
+    if refinement.is_near(T_begun, [found.T_target_source]):
         return _Start(replace(coarse, T_target_source=T_begun), 0.0)
     most = score.shipped().most_lead(found.agreement.counts, trial.least_odds)
     if _lead(found, T_begun, trial) > most + APPROACH_LEAD:

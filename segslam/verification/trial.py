@@ -31,7 +31,7 @@ NUM_FLOOR_PLANS = 4
 """Number of floor plans in memory: a scan is compared with several others in turn. A source has 12 MB of spectra."""
 
 MIN_INLIERS = 3
-"""Chosen: smallest number of clique members consistent with a coarse pose."""
+"""Three positions determine a pose: smallest number of clique members consistent with a coarse one."""
 
 NUM_FEW = 4
 """Number of sources of which few points are in memory."""

@@ -6,7 +6,8 @@ from segslam.core import geometry
 from segslam.core.config import GraphConfig
 from segslam.core.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Registration
 from segslam.graph import PoseGraph
-from segslam.graph.confirmation import MIN_CONSISTENT, WAITING_M, Confirmation
+from segslam.graph.confirmation import MIN_CONSISTENT, Confirmation
+from segslam.graph.motions import PLACE_M
 
 STEP_M = 2.0
 NUM = 200
@@ -38,7 +39,7 @@ def test_registrations_wait_for_others_that_are_near() -> None:
     sources = [190, 194, 197]
     for source_id in sources[:-1]:
         assert not are_closed(attempts(confirmation, graph, source_id))
-    assert not confirmation.is_waiting(10), "it is farther than WAITING_M"
+    assert not confirmation.is_waiting(10), "it is farther than PLACE_M"
     found = attempts(confirmation, graph, sources[-1])
     assert are_closed(found), "a search that begins with the first keyframes again drops none"
     assert len(found) == MIN_CONSISTENT
@@ -48,7 +49,7 @@ def test_registrations_wait_for_others_that_are_near() -> None:
 def test_a_confirmation_leaves_those_that_wait_elsewhere() -> None:
     graph = drive()
     confirmation = Confirmation(graph)
-    far_id = 197 - int(2 * WAITING_M / STEP_M)
+    far_id = 197 - int(2 * PLACE_M / STEP_M)
     attempts(confirmation, graph, far_id)
     for source_id in (190, 194, 197):
         found = attempts(confirmation, graph, source_id)

@@ -178,7 +178,7 @@ def test_the_first_iterations_decide_whether_a_rival_is_refined(
 ) -> None:
     """The pose from which refinement starts is beside the one to which it leads; `least` is added to its lead."""
     trial, found = _found_pose()
-    monkeypatch.setattr(rivals, "is_same", lambda *_: False)
+    monkeypatch.setattr(refinement, "is_near", lambda *_: False)
     lead = rivals._lead
     monkeypatch.setattr(rivals, "_lead", lambda *given: lead(*given) + least)
     refined = []

@@ -21,7 +21,7 @@ from segslam.core.threads import Stopwatch
 from segslam.core.types import LoopCandidate, Placement, Rejected, RejectReason, Transform
 from segslam.graph import AnchoredGraph
 from segslam.graph.chains import far_from_prior
-from segslam.graph.confirmation import WAITING_M
+from segslam.graph.motions import PLACE_M
 from segslam.keyframes import Submaps
 from segslam.registration import refinement
 from segslam.registration.prepared import Observed, prepare_observed
@@ -119,7 +119,7 @@ class Placer:
         if self._last is not None and self._agree(self._last, found, np.inf):
             return self._taken((found,)), None
         for earlier in reversed(self._found):
-            if self._agree(earlier, found, WAITING_M):
+            if self._agree(earlier, found, PLACE_M):
                 return self._taken((earlier, found)), None
         self._found.append(found)
         return (), Rejected(RejectReason.UNCONFIRMED, "found, but not yet confirmed by another keyframe")

@@ -13,10 +13,9 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from segslam.core import geometry
 from segslam.core.types import Transform, Vector
+from segslam.registration import refinement
 from segslam.verification.patches import BINS, FREE_SPACE, KINDS, Counts, Shown, counted
-from segslam.verification.rivals import SAME_POSE_M, SAME_POSE_RAD
 from segslam.verification.score import MISLED, NO_OTHER, Table, Weights, paired_lead, violating_root
 
 PRIOR_COUNT = 0.5
@@ -112,9 +111,7 @@ def best_of(pair: Pair, table: Table) -> Best | None:
     leads = [
         paired_lead(table.ratios, [(best.of_source, pose.of_source), (best.of_target, pose.of_target)])
         for pose in pair.poses
-        if not geometry.is_near(
-            pose.T_target_source, [best.T_target_source], within_m=SAME_POSE_M, within_rad=SAME_POSE_RAD
-        )
+        if not refinement.is_near(pose.T_target_source, [best.T_target_source])
     ]
     return Best(pair, best, ratios[first], min([*leads, NO_OTHER]))
 

@@ -142,6 +142,9 @@ def test_a_run_is_evaluated_exported_and_reported_by_public_names(made: MadeRun,
         (run.result.trajectory.T_world_lidar, made.truth.T_world_lidar),
         (tmp_path / "tum.txt", str(tmp_path / "true.txt")),
         (run.result.trajectory.T_world_lidar, tmp_path / "true.txt"),
+        (made.folder, None),
+        (str(made.folder / "log.mcap"), None),
+        (made.truth, made.folder),
     ):
         assert segslam.evaluate(estimate, reference)["ate_m"] == pytest.approx(figures["ate_m"], rel=1e-4)
     with pytest.raises(segslam.SegslamError, match="one for each"):

@@ -8,11 +8,13 @@ import numpy as np
 from segslam.core.evaluation import Z_UP
 from segslam.core.trajectory import PoseFile, Poses, read_poses, rows_of_same_scan, rows_of_same_stamp
 from segslam.core.types import SegslamError, Trajectory
+from segslam.core.whole_files import expanded
 from segslam.output.accuracy import Align, scores
-from segslam.output.finished import STAMP_TOLERANCE_NS, FinishedRun
+from segslam.output.finished import STAMP_TOLERANCE_NS, FinishedRun, read_run
+from segslam.output.folder import folder_of
 
 Given = FinishedRun | Trajectory | Poses | str | Path
-"""A run, a trajectory, poses (n, 4, 4), or a pose file in KITTI or TUM format."""
+"""A run, its folder or log, a trajectory, poses (n, 4, 4), or a pose file in KITTI or TUM format."""
 
 
 def evaluate(
@@ -33,28 +35,32 @@ def evaluate(
         raise SegslamError(f"evaluate: align={align!r}: unknown; known: {', '.join(get_args(Align))}")
     if rpe_distance_m is not None and not rpe_distance_m > 0.0:
         raise SegslamError(f"evaluate: rpe_distance_m={rpe_distance_m}; give a distance above 0")
+    made = _read(estimate)
     if reference is None:
-        reference = estimate.reference if isinstance(estimate, FinishedRun) else None
+        reference = made.reference if isinstance(made, FinishedRun) else None
         if reference is None:
             raise SegslamError("evaluate: no ground truth; give `reference`")
-    matched, truth = matched_poses(_known(estimate), _known(reference))
+    matched, truth = matched_poses(_poses(made), _poses(_read(reference)))
     figures = scores(matched, truth, align=align, rpe_distance_m=rpe_distance_m, up=up)
     if not figures:
         raise SegslamError(f"evaluate: only {len(matched)} poses match the reference; at least three are needed")
     return figures
 
 
-def _known(given: Given) -> Trajectory | PoseFile:
-    if isinstance(given, FinishedRun):
-        return given.result.trajectory
-    if isinstance(given, Trajectory):
+def _read(given: Given) -> FinishedRun | Trajectory | PoseFile:
+    if isinstance(given, FinishedRun | Trajectory):
         return given
     if isinstance(given, str | Path):
-        return read_poses(Path(given))
+        path = expanded(given)
+        return read_run(path) if folder_of(path).is_dir() else read_poses(path)
     poses = np.asarray(given, dtype=np.float64)
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
         raise SegslamError(f"evaluate: poses of shape {poses.shape}; give finite matrices, (n, 4, 4)")
     return PoseFile(poses, None)
+
+
+def _poses(known: FinishedRun | Trajectory | PoseFile) -> Trajectory | PoseFile:
+    return known.result.trajectory if isinstance(known, FinishedRun) else known
 
 
 def matched_poses(

@@ -70,7 +70,7 @@ def write_maps(
     if twice := [file for file in files if files.count(file) > 1]:
         raise SegslamError(f"{twice[0]}: given twice; give each file once")
     of_map = [file for file in files if file.name != BEFORE_AFTER and not is_track(file)]
-    check_files(of_map, origin=origin)
+    check_files(of_map, origin=origin, others=KINDS)
     with ExitStack() as complete:  # moves each file to its name at the end, after a failure none
         for file in files:
             if file.name == BEFORE_AFTER:

@@ -57,6 +57,7 @@ def test_export_prints_the_number_of_removed_points(
     ("arguments", "output"),
     [
         (["map.stl"], "map.stl: unknown kind of map; its name must end in .ply, .pcd, .las, .laz, .png, .yaml"),
+        (["map.stl"], ".tif, .tiff, .geojson, .kml, .gpx"),
         (["no/such/map.ply"], "there is no folder"),
         (["map.ply", "--set", "map.colour=height"], "unknown key map.colour; known keys: voxel_m,"),
         (["map.ply", "--set", "map.voxel_m=0"], "map.voxel_m: Input should be greater than or equal to 0.02, got 0"),

@@ -51,12 +51,15 @@ SHARES = 0.01, 0.99
 """Share of the voxels, at both ends, that the colour scale ignores as outliers."""
 
 
-def check_names(files: Sequence[Path], *, origin: "Origin | None" = None) -> None:
-    """Raises SegslamError for a file with an unknown extension, or one that needs a missing package or the origin."""
+def check_names(files: Sequence[Path], *, origin: "Origin | None" = None, others: Iterable[str] = ()) -> None:
+    """Raises SegslamError for a file with an unknown extension, or one that needs a missing package or the origin.
+
+    `others`: known extensions of files that are no maps, for the message.
+    """
     for file in files:
         kind = KINDS.get(file.suffix.lower())
         if kind is None:
-            raise SegslamError(f"{file}: unknown kind of map; its name must end in {', '.join(KINDS)}")
+            raise SegslamError(f"{file}: unknown kind of map; its name must end in {', '.join([*KINDS, *others])}")
         if kind is LasCloud:
             _check_packages(file, "LAS and LAZ need", ("laspy", "lazrs"), extra="las", others=".ply and .pcd do not")
         if kind is LasCloud and origin is not None:
@@ -74,9 +77,9 @@ def _check_packages(file: Path, needs: str, packages: Sequence[str], *, extra: s
         raise SegslamError(f"{file}: {needs} extra packages: {how_to_install(extra)}; {others}")
 
 
-def check_files(files: Sequence[Path], *, origin: "Origin | None" = None) -> None:
+def check_files(files: Sequence[Path], *, origin: "Origin | None" = None, others: Iterable[str] = ()) -> None:
     """Raises SegslamError as `check_names`, and for a file that cannot be written."""
-    check_names(files, origin=origin)
+    check_names(files, origin=origin, others=others)
     for file in files:
         check_target(file)
 

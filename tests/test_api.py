@@ -195,6 +195,8 @@ WRONG_KINDS = {
     "segslam.open_dataset('.', frames=5)": "frames 5: give a text, 'A:B'",
     "segslam.open_dataset('kitti', sequence=0)": "sequence 0: give a text, for example '00'",
     "segslam.open_dataset('kitti', labels=5)": "labels 5: give a text",
+    "segslam.open_dataset('kitti', vertical_angle_deg=np.nan)": "vertical_angle_deg: Input should be a finite number",
+    "segslam.open_dataset('kitti', vertical_angle_deg=[1])": "vertical_angle_deg: Input should be a valid number",
     "segslam.fleet(5, 'fleet')": "5: not a path",
     "segslam.export(made, 5)": "5: not a path",
     "segslam.fleet(['.'], 'fleet', num_workers=0)": "num_workers=0",

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from segslam.core.config import SensorCalibrationConfig, validated
 from segslam.core.errors import brief, counted
 from segslam.core.geometry import raise_beams
 from segslam.core.points import squared_ranges
@@ -126,7 +127,8 @@ class DataSource:
             raise SegslamError(f"{folder}: no such file or folder; give the folder with sequences/ or with the scans")
         if self.encoding not in (None, *ENCODINGS):
             raise SegslamError(f"encoding {self.encoding}: unknown; known: {', '.join(ENCODINGS)}")
-        source = replace(self, data=folder)
+        sensor = validated(SensorCalibrationConfig, {"vertical_angle_deg": self.vertical_angle_deg}, str(folder))
+        source = replace(self, data=folder, vertical_angle_deg=sensor.vertical_angle_deg)
         from segslam.scans.kitti import KittiSequence, is_kitti
 
         try:

@@ -146,6 +146,10 @@ def test_a_value_of_set_that_is_no_yaml_is_refused_in_one_short_line(value: str)
     assert len(str(refused.value)) < 1000
 
 
+def test_one_setting_may_be_given_alone() -> None:
+    assert load_config(None, "graph.final=gnc") == load_config(None, ["graph.final=gnc"])
+
+
 def test_a_path_may_be_text(tmp_path: Path) -> None:
     file = tmp_path / "one.yaml"
     file.write_text("keyframes: {distance_m: 3.0}")

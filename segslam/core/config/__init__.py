@@ -4,7 +4,7 @@ The YAML of files and of `--set` may be damaged or malicious.
 """
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -128,6 +128,7 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = (), *
     for name, section in given.items():
         known = values.get(name)
         values[name] = known | section if isinstance(known, dict) and isinstance(section, dict) else section
+    overrides = setting_texts(overrides)
     source = " and ".join([*([str(path)] if path else []), *(["--set"] if overrides or not path else [])])
     overridden = with_overrides(values, overrides, source=source, example="keyframes.distance_m=1.5")
     return validated(Config, _without_removed(overridden, source), source)
@@ -137,6 +138,14 @@ def check_config(config: Config | None) -> None:
     """Raises SegslamError for settings that are neither a Config nor None."""
     if not isinstance(config, Config | None):
         raise SegslamError(f"config: {brief(str(config))} is not a Config; give one, for example load_config(FILE)")
+
+
+def setting_texts(settings: str | Iterable[str]) -> list[str]:
+    """The `section.key=value` texts, of which one may be given alone. Raises SegslamError for anything else."""
+    texts = list(settings) if isinstance(settings, Iterable) and not isinstance(settings, str) else [settings]
+    if not all(isinstance(text, str) for text in texts):
+        raise SegslamError(f"settings {short(settings)}: give texts, each section.key=value")
+    return texts
 
 
 def with_overrides(values: dict[str, Any], overrides: Sequence[str], *, source: str, example: str) -> dict[str, Any]:

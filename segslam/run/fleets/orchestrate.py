@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from segslam.core.config import setting_texts
 from segslam.core.threads import Stopwatch
 from segslam.core.types import SegslamError, WorkFailed
 from segslam.core.whole_files import expanded, write_whole
@@ -70,6 +71,7 @@ def fleet(
     """
     if num_workers is not None and num_workers < 1:
         raise SegslamError(f"fleet: num_workers={num_workers}; give 1 or more")
+    settings = setting_texts(settings)
     if isinstance(drives, Iterable) and not isinstance(drives, str):
         listed = drives_of(drives)
     else:

@@ -90,14 +90,17 @@ class Terminal:
         elif not self.quiet:
             print(text, flush=True)
 
-    def progress(self, items: Iterable[Item], total: int, title: str) -> Iterator[Item]:
-        """Yield the items; show a bar on a terminal, or print a line every ten seconds; no output if quiet."""
+    def progress(self, items: Iterable[Item], total: int, title: str, *, num_before: int = 0) -> Iterator[Item]:
+        """Yield the items; show a bar on a terminal, or print a line every ten seconds; no output if quiet.
+
+        `num_before`: number of first items that were finished in an earlier run; the rate is that of the others.
+        """
         if self.quiet:
             yield from items
         elif sys.stderr.isatty():
-            yield from _bar(items, total, title)
+            yield from _bar(items, total, title, num_before)
         else:
-            yield from _lines(items, total, title)
+            yield from _lines(items, total, title, num_before)
 
     def compile_kernels(self) -> int:
         """Compile all kernels, with a progress bar, unless they are compiled; returns the number of compiled kernels.
@@ -137,7 +140,7 @@ def how_to_go_on(line: str) -> Iterator[None]:
         raise WorkFailed(f"{error}; {line}") from error
 
 
-def _bar(items: Iterable[Item], total: int, title: str) -> Iterator[Item]:
+def _bar(items: Iterable[Item], total: int, title: str, num_before: int) -> Iterator[Item]:
     from rich import progress
     from rich.console import Console
     from rich.text import Text
@@ -153,18 +156,19 @@ def _bar(items: Iterable[Item], total: int, title: str) -> Iterator[Item]:
         *(Rate(), progress.TimeRemainingColumn()),
     )
     with progress.Progress(*columns, console=Console(stderr=True)) as bars:
-        task = bars.add_task(title, total=total)
-        for item in items:
+        task = bars.add_task(title, total=total, completed=num_before)
+        for done, item in enumerate(items, start=1):
             yield item
-            bars.advance(task)
+            if done > num_before:
+                bars.advance(task)
 
 
-def _lines(items: Iterable[Item], total: int, title: str) -> Iterator[Item]:
+def _lines(items: Iterable[Item], total: int, title: str, num_before: int) -> Iterator[Item]:
     started = last = monotonic()
     for done, item in enumerate(items, start=1):
         yield item
         now = monotonic()
-        if now - last >= 10 or done == total:
-            rate = done / max(now - started, 1e-9)
+        if done > num_before and (now - last >= 10 or done == total):
+            rate = (done - num_before) / max(now - started, 1e-9)
             say(f"{title}: {done}/{total}, {rate:.1f}/s, {(total - done) / rate:.0f} s left")
             last = now

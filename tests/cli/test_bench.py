@@ -79,6 +79,8 @@ def test_a_benchmark_is_replaced_only_if_wanted(data: Path, tmp_path: Path, caps
     out, options = tmp_path / "out", ("--method", "segator", "--labels", "true_labels", "--quiet")
     call = ("bench", "pairs", data, "--pairs", data / "pairs.txt", *options, "--out", out)
     assert run(*call) == 0
+    assert run(*(one for one in call if one != "--quiet")) == 0
+    assert "bench: 3/3" not in capsys.readouterr().err  # all were finished before
     rows = (out / "details.csv").read_text().replace(",segator,True,", ",segator,False,")
     for more, kept in (((), True), (("--overwrite",), False)):
         (out / "details.csv").write_text(rows)

@@ -86,6 +86,16 @@ def test_a_bar_passes_all_items_on(monkeypatch: pytest.MonkeyPatch) -> None:
     assert list(Terminal().progress(iter(range(3)), total=3, title="count")) == [0, 1, 2]
 
 
+def test_the_rate_is_that_of_this_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    seconds = iter([0.0, *([1.0] * 100), 11.0, 21.0])
+    monkeypatch.setattr("segslam.cli.console.monotonic", lambda: next(seconds))
+    assert len(list(Terminal().progress(range(102), total=102, title="bench", num_before=100))) == 102
+    assert capsys.readouterr().err.splitlines() == [
+        "bench: 101/102, 0.1/s, 11 s left",
+        "bench: 102/102, 0.1/s, 0 s left",
+    ]
+
+
 @pytest.mark.slow
 def test_the_first_command_on_a_machine_shows_that_it_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))

@@ -46,6 +46,11 @@ def run(
         yield rows
 
 
+def num_finished(folder: Path, job: Job, trials: Sequence[Trial]) -> int:
+    """Number of trials whose rows are in the folder; raises SegslamError if it contains another benchmark."""
+    return len({row.trial_key for row in _rows_before(folder, job, trials)})
+
+
 def in_order(rows: Sequence[Row], job: Job, trials: Sequence[Trial]) -> list[Row]:
     """The rows in the order of a single process, whatever the order in which they were finished."""
     place = {trial.key: number for number, trial in enumerate(trials)}

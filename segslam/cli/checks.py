@@ -1,5 +1,6 @@
 """Checks before a command begins: its input exists, a run can be resumed, nothing is replaced unasked; presets."""
 
+import shlex
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -136,6 +137,18 @@ def log_to_resume(folder: Path) -> "RunLog":
     if is_being_written(log):
         raise SegslamError(f"{log}: the run is still in progress; stop it before you resume it")
     return read_log(log)
+
+
+def why_not_resumed(options: Mapping[str, str], run: Path) -> str:
+    """Why `segslam resume` refuses a run with these options in its log, and the remedy; empty if it does not."""
+    if options.get("live"):
+        again = f"segslam replay {shlex.quote(str(run))} --out NEW"
+        return f"a live run cannot be resumed, because its scans were not stored; to make its results: {again}"
+    if options.get("sessions"):
+        return "of merged runs; merge them again into a new folder"
+    if own := options.get("python"):
+        return f"made from Python with its own {own}; map the data again from there"
+    return ""
 
 
 def check_same(recorded: "RunLog", settings: "Config", *, dataset: str, options: Mapping[str, str]) -> None:

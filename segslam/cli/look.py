@@ -5,7 +5,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from segslam.cli.checks import check_free, check_links, check_run
+from segslam.cli.checks import check_free, check_links, check_run, why_not_resumed
 from segslam.cli.console import Terminal
 from segslam.cli.options import LogArgument, OverwriteOption
 from segslam.cli.tables import with_meanings
@@ -21,8 +21,6 @@ SHOWN = (
     *("num_motions_repaired", "num_motions_broken", "ate_m", "odometry_ate_m", "kiss_icp_ate_m", "map_thickness_m"),
 )
 """Figures of the run that are shown, if known."""
-NOT_RESUMED = ("live", "sessions", "python")
-"""Options in the logs of runs that `segslam resume` refuses: live, merged, or made from Python with own odometry."""
 
 
 def info(run: LogArgument, *, terminal: Terminal) -> None:
@@ -111,7 +109,8 @@ def _lines(found: dict[str, Any]) -> str:
 
     num_steps = counted(found["num_steps"], "scan")
     is_replay = "num_scans_left" in found["figures"] and "data" not in found["options"]
-    is_resumable = found["state"] == "interrupted" and not is_replay and found["options"].keys().isdisjoint(NOT_RESUMED)
+    is_refused = is_replay or why_not_resumed(found["options"], Path(found["run"]))
+    is_resumable = found["state"] == "interrupted" and not is_refused
     then = f"; continue with: segslam resume {shlex.quote(found['run'])}" if is_resumable else ""
     text = [f"{found['run']}: {found['data']}, {found['state']}, {num_steps} in the log{then}"]
     text += with_meanings([found["figures"]], {key: FIGURES[key] for key in found["figures"]}).splitlines()

@@ -21,6 +21,7 @@ from segslam.cli.checks import (
     make_folder,
     outside,
     preset_config,
+    why_not_resumed,
 )
 from segslam.cli.console import Terminal, how_to_go_on, print_json, say
 from segslam.cli.dry_run import found_in, lines
@@ -95,21 +96,12 @@ def resume(
     recorded = log_to_resume(run)
     chosen: dict[str, Any] = {name: value for name, value in recorded.options.items() if value}
     again = f"segslam map DATA --out {shlex.quote(str(run))} --resume"
-    if "live" in chosen:
-        raise SegslamError(
-            f"{recorded.path}: a live run cannot be resumed, because its scans were not stored; to make its results: "
-            f"segslam replay {shlex.quote(str(run))} --out NEW"
-        )
-    if "sessions" in chosen:
-        raise SegslamError(f"{recorded.path}: of merged runs; merge them again into a new folder")
+    if why := why_not_resumed(chosen, run):
+        raise SegslamError(f"{recorded.path}: {why}")
     if "data" not in chosen:
         raise SegslamError(f"{recorded.path}: has no path of the data; resume with: {again}")
     data = Path(chosen["data"])
     check_exists(data, f"{recorded.path} was started with it. Restore it, or: {again}")
-    if "python" in chosen:
-        raise SegslamError(
-            f"{recorded.path}: made from Python with its own {chosen['python']}; map the data again from there"
-        )
     from segslam.labels.encodings import ENCODINGS
 
     if (numbering := chosen.get("encoding", "raw")) not in ENCODINGS:

@@ -230,9 +230,10 @@ def test_a_run_from_python_is_resumed_by_the_command(scans: Path, tmp_path: Path
 def test_a_run_from_python_with_its_own_parts_is_not_resumed(
     scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = _started(tmp_path / "run", scans, **(resume_options(DataSource(scans)) | {"python": "odometry"}))
-    assert run("resume", folder) == 2
-    assert "made from Python with its own odometry" in capsys.readouterr().err
+    for number, data in enumerate((scans, tmp_path / "moved")):  # restored data would not help
+        options = resume_options(DataSource(data)) | {"python": "odometry"}
+        assert run("resume", _started(tmp_path / f"run_{number}", scans, **options)) == 2
+        assert "made from Python with its own odometry" in capsys.readouterr().err
     map_folder(scans, tmp_path / "placed", frames="0:2", place=lambda _: "")
     assert run("resume", tmp_path / "placed") == 2
     assert "made from Python with its own place" in capsys.readouterr().err

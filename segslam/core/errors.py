@@ -29,7 +29,12 @@ def brief(text: str, num_characters: int = 80) -> str:
 
 def counted(number: int, thing: str) -> str:
     """A number and its noun, in the plural if it is not 1."""
-    return f"{number} {thing}{'s' * (number != 1)}"
+    return f"{number} {noun(number, thing)}"
+
+
+def noun(number: float, thing: str) -> str:
+    """A noun, in the plural if its number is not 1."""
+    return thing if number == 1 else f"{thing}s"
 
 
 def unreadable(path: object, content: str, error: Exception) -> str:

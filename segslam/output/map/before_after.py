@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from segslam.core import geometry
+from segslam.core.errors import noun
 from segslam.core.points import within_range
 from segslam.core.processes import in_parts
 from segslam.core.types import (
@@ -110,7 +111,7 @@ class BeforeAfter:
         figure = Figure(figsize=(12.0, 6.0 * sum(heights) + 0.5), facecolor=BACKGROUND, layout=layout)
         grid = figure.subplots(len(heights), 2, squeeze=False, height_ratios=heights)
         num = len(self._loops)
-        corrected = f"corrected by {num} loop{'s' * (num != 1)}" if num else "adjusted as a whole; no loop was found"
+        corrected = f"corrected by {num} {noun(num, 'loop')}" if num else "adjusted as a whole; no loop was found"
         titles = ("before: odometry only", f"after: {corrected}")
         for row, panels in zip(grid, rows, strict=True):
             brightest = max(panel.brightest() for panel in panels)

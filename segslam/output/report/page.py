@@ -8,7 +8,7 @@ from importlib import resources
 from typing import Any
 
 from segslam.core.config import Config, changed_settings
-from segslam.core.errors import counted
+from segslam.core.errors import counted, noun
 from segslam.core.types import Rejected
 from segslam.output.finished import COMPARED, FinishedRun, plain_name
 from segslam.output.words import CONDITIONS, FIGURES, FILES, REASONS, WORDS
@@ -82,7 +82,7 @@ def _tiles(metrics: dict[str, Any]) -> str:
         ("peak_rss_mb", " MB", "peak memory"),
     ]
     known = [(metrics[key], unit, text) for key, unit, text in tiles if key in metrics]
-    named = [(value, unit, text.replace("loops", "loop") if value == 1 else text) for value, unit, text in known]
+    named = [(value, unit, text.replace("loops", noun(value, "loop"))) for value, unit, text in known]
     return "".join(f"<div><b>{number(value)}{unit}</b>{text}</div>" for value, unit, text in named)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import matplotlib
 from matplotlib.figure import Figure
 
-from segslam.core.errors import counted
+from segslam.core.errors import counted, noun
 from segslam.core.trajectory import Poses, read_poses
 from segslam.core.whole_files import write_whole
 from segslam.output.report import figures
@@ -32,8 +32,8 @@ def write_report(result: "FleetResult") -> Path:
     components, loops = len(result.components), result.num_loops_between
     body = (
         f'<div class="tiles"><div><b>{num_mapped} of {len(result.drives)}</b>drives mapped</div>'
-        f"<div><b>{components}</b>component{'s' * (components != 1)}</div>"
-        f"<div><b>{loops}</b>loop{'s' * (loops != 1)} between drives</div></div>\n"
+        f"<div><b>{components}</b>{noun(components, 'component')}</div>"
+        f"<div><b>{loops}</b>{noun(loops, 'loop')} between drives</div></div>\n"
         f"{section('Components', _components(result))}{section('Drives', _drives(result.drives))}"
         f'<div class="plots">{plots}</div>'
     )

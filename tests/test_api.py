@@ -70,6 +70,8 @@ def test_slam_counts_scans_that_have_no_number() -> None:
     slam = segslam.Slam()
     for scan in round_drive()[0][:3]:
         slam.process(segslam.Scan(scan.points, scan.stamp_ns))
+    with pytest.raises(segslam.BadScan, match="scan 3: its stamp"):
+        slam.process(segslam.Scan(scan.points, scan.stamp_ns))
     assert slam.finish().trajectory.scan_index.tolist() == [0, 1, 2]
 
 
@@ -174,6 +176,7 @@ def test_odd_arguments_are_refused_in_one_line(tmp_path: Path) -> None:
 WRONG_KINDS = {
     "segslam.Slam('x.yaml')": "x.yaml is not a Config",
     "segslam.Slam({})": "{} is not a Config",
+    "segslam.Slam().process(np.ones((5, 3)))": "scan: a ndarray; give a Scan, as in Scan(points, stamp_ns)",
     "segslam.map_folder('.', 'run', config='x.yaml')": "x.yaml is not a Config",
     "segslam.merge(['.'], 'run', config=5)": "5 is not a Config",
     "segslam.merge('.', 'run')": "1 run given",
@@ -206,10 +209,15 @@ WRONG_KINDS = {
     "segslam.load_config(None, [5])": "settings [5]: give texts",
     "segslam.Scan(np.ones((5, 3)), 0.5)": "stamp_ns 0.5: give integer nanoseconds",
     "segslam.Scan(np.ones((5, 3)), 0, times=np.ones(3))": "3 times for 5 points",
+    "segslam.Scan(np.ones((2, 3)), 0, times=[0, np.nan])": "times: not all are numbers from 0",
+    "segslam.Scan(np.ones((2, 3)), 0, times=[0, 1e8])": "times: not all are numbers from 0",
+    "segslam.Scan(np.ones((2, 3)), 0, times=np.zeros((2, 1, 2)))": "4 times for 2 points",
+    "segslam.Scan(np.ones((5, 3)), 0, 2.5)": "index 2.5: give an integer, or None",
     "segslam.Scan(np.ones((5, 3)), 0, labels=np.ones(2, np.uint8))": "2 labels for 5 points",
     "segslam.Scan(np.ones((5, 3)), 0, labels=['road'] * 5)": "labels: not an array of numbers",
     "segslam.Scan(np.ones((2, 3)), 0, labels=[9, 65545])": "labels: 65545 is not a learning id",
     "segslam.Scan(np.ones((5, 3)), 0, intensities=np.ones(3))": "intensities: 3 for 5 points",
+    "segslam.Scan(np.ones((2, 3)), 0, intensities=['a', 'b'])": "intensities: 2 for 2 points; give one number for each",
     "segslam.evaluate(np.eye(4)[None], np.eye(4)[None], align='Sim3')": "align='Sim3': unknown; known: se3",
     "segslam.fleet('~unknown-user/drives.yaml', 'fleet')": "there is no user with this name",
     "segslam.read_run('scan.bin')": "not a run",

@@ -190,20 +190,24 @@ class Scan(Record):
     ) -> None:
         """`points`: array-like with at least 3 columns; the first 3 are used. The others may be array-like, too.
 
-        Raises SegslamError for another shape, for a stamp that is no integer, and for labels, times or intensities that
-        are not one for each point.
+        Raises SegslamError for another shape, for a stamp or number that is no integer, for labels, times or
+        intensities that are not one for each point, and for times that are not from 0 to 1.
         """
         xyz = as_points(points)
         if not isinstance(stamp_ns, int | np.integer):
             raise SegslamError(f"stamp_ns {stamp_ns!r}: give integer nanoseconds")
+        if not isinstance(index, int | np.integer | None):
+            raise SegslamError(f"index {index!r}: give an integer, or None")
         labels = labels if callable(labels) else as_labels(labels, xyz)
         labels = np.zeros(len(xyz), np.uint8) if labels is None else labels
         times = np.empty(0) if times is None else np.asarray(times)
-        if len(times) not in (0, len(xyz)):
-            raise SegslamError(f"times: {len(times)} times for {len(xyz)} points; give one for each, or none")
+        if times.shape not in ((0,), (len(xyz),)):
+            raise SegslamError(f"times: {times.size} times for {len(xyz)} points; give one for each, or none")
+        if times.dtype.kind not in "biuf" or not ((times >= 0) & (times <= 1)).all():
+            raise SegslamError("times: not all are numbers from 0, the start of the sweep, to 1, its end; or give none")
         intensities = None if intensities is None else np.asarray(intensities)
-        if intensities is not None and len(intensities) != len(xyz):
-            raise SegslamError(f"intensities: {len(intensities)} for {len(xyz)} points; give one for each")
+        if intensities is not None and (intensities.shape != (len(xyz),) or intensities.dtype.kind not in "biuf"):
+            raise SegslamError(f"intensities: {intensities.size} for {len(xyz)} points; give one number for each")
         values = (xyz, stamp_ns, index, labels, times, intensities, kept)
         for one, value in zip(fields(self), values, strict=True):
             object.__setattr__(self, one.name, value)

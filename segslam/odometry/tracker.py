@@ -60,12 +60,12 @@ class Tracker:
         if it is known; the odometry then works on both at the same time, with the same results. Raises BadScan, and
         ignores the scan, if it cannot be used or is not later than the previous scan.
         """
+        index = self._num_tracked if scan.index is None else scan.index
         if self._last_stamp_ns is not None and scan.stamp_ns <= self._last_stamp_ns:
             raise LateScan(
-                f"scan {scan.index}: its stamp {scan.stamp_ns} ns is not later than that of the previous scan, "
+                f"scan {index}: its stamp {scan.stamp_ns} ns is not later than that of the previous scan, "
                 f"{self._last_stamp_ns} ns; give each scan once, in order of time and by one clock"
             )
-        index = self._num_tracked if scan.index is None else scan.index
         scan = replace(scan, index=index)
         watch = Stopwatch()
         with watch("odometry"):

@@ -114,6 +114,8 @@ class Slam:
 
         `ahead`: the scan that is tracked next, if it is known: saves time.
         """
+        if not isinstance(scan, Scan):
+            raise SegslamError(f"scan: a {type(scan).__name__}; give a Scan, as in Scan(points, stamp_ns)")
         if self._is_finished:
             raise SegslamError(f"scan {scan.index}: the run is finished; map further scans with a new Slam")
         return self._tracker.track(scan, ahead=ahead)

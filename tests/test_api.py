@@ -149,6 +149,7 @@ def test_a_run_is_evaluated_exported_and_reported_by_public_names(made: MadeRun,
         (made.truth, made.folder),
     ):
         assert segslam.evaluate(estimate, reference)["ate_m"] == pytest.approx(figures["ate_m"], rel=1e-4)
+    assert segslam.evaluate(run, up=(0, 0, 2)) == figures
     with pytest.raises(segslam.SegslamError, match="one for each"):
         segslam.evaluate(run.result.trajectory.T_world_lidar[:-1], made.truth.T_world_lidar)
     with pytest.raises(segslam.SegslamError, match="rpe_distance_m=0; give a distance above 0"):
@@ -180,6 +181,7 @@ WRONG_KINDS = {
     "segslam.map_folder('.', 'run', config='x.yaml')": "x.yaml is not a Config",
     "segslam.merge(['.'], 'run', config=5)": "5 is not a Config",
     "segslam.merge('.', 'run')": "1 run given",
+    "segslam.merge([], 'run')": "0 runs given",
     "segslam.register(np.ones((3, 3)), np.ones((3, 3)), config='x.yaml')": "x.yaml is not a Config",
     "segslam.load_config(5)": "5: not a path",
     "segslam.open_dataset(5)": "5: not a path",
@@ -219,6 +221,12 @@ WRONG_KINDS = {
     "segslam.Scan(np.ones((5, 3)), 0, intensities=np.ones(3))": "intensities: 3 for 5 points",
     "segslam.Scan(np.ones((2, 3)), 0, intensities=['a', 'b'])": "intensities: 2 for 2 points; give one number for each",
     "segslam.evaluate(np.eye(4)[None], np.eye(4)[None], align='Sim3')": "align='Sim3': unknown; known: se3",
+    "segslam.evaluate(np.zeros((3, 4, 4)), np.ones((3, 4, 4)))": "evaluate: a matrix is not a pose",
+    "segslam.evaluate(segslam.Config(), made)": "evaluate: Config() is no array; give finite matrices",
+    "segslam.evaluate(made, up=(0, 0, 0))": "evaluate: up=(0, 0, 0); give the direction",
+    "segslam.evaluate(made, up='z')": "evaluate: up=z; give the direction",
+    "segslam.read_run(made).result.errors(2 * np.repeat(np.eye(4)[None], 120, axis=0))": "reference: a matrix is not a",
+    "segslam.read_run(made).result.errors('poses.txt')": "reference: poses.txt is no array",
     "segslam.fleet('~unknown-user/drives.yaml', 'fleet')": "there is no user with this name",
     "segslam.read_run('scan.bin')": "not a run",
 }

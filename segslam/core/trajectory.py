@@ -105,6 +105,20 @@ def read_poses(path: Path, *, format: PoseFormat | None = None, skips_names: boo
     return PoseFile(poses, np.array(stamps, dtype=np.int64) if chosen == "tum" else None)
 
 
+def as_poses(given: object, name: str) -> Poses:
+    """Poses of an array-like object, (n, 4, 4). Raises SegslamError, with the name, for anything else."""
+    try:
+        poses = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SegslamError(f"{name}: {brief(str(given))} is no array; give finite matrices, (n, 4, 4)") from error
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
+        raise SegslamError(f"{name}: poses of shape {poses.shape}; give finite matrices, (n, 4, 4)")
+    off = np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0)
+    if len(poses) and max(off, _from_matrices(poses[:, :3])[1].max()) > ROTATION_TOLERANCE:
+        raise SegslamError(f"{name}: a matrix is not a pose: a rotation and a translation, then the row 0 0 0 1")
+    return poses
+
+
 def write_kitti(path: Path, T_a_b: Poses) -> None:
     """Write one pose per line, 12 numbers, as read by evo's `kitti`. The poses must be in the frame of the file."""
     np.savetxt(path, T_a_b[:, :3].reshape(-1, 12), fmt="%.12g")

@@ -6,7 +6,7 @@ from typing import get_args
 import numpy as np
 
 from segslam.core.evaluation import Z_UP
-from segslam.core.trajectory import PoseFile, Poses, read_poses, rows_of_same_scan, rows_of_same_stamp
+from segslam.core.trajectory import PoseFile, Poses, as_poses, read_poses, rows_of_same_scan, rows_of_same_stamp
 from segslam.core.types import SegslamError, Trajectory
 from segslam.core.whole_files import expanded
 from segslam.output.accuracy import Align, scores
@@ -35,13 +35,16 @@ def evaluate(
         raise SegslamError(f"evaluate: align={align!r}: unknown; known: {', '.join(get_args(Align))}")
     if rpe_distance_m is not None and not rpe_distance_m > 0.0:
         raise SegslamError(f"evaluate: rpe_distance_m={rpe_distance_m}; give a distance above 0")
+    if np.shape(up) != (3,) or not 0.0 < np.linalg.norm(up) < np.inf:
+        raise SegslamError(f"evaluate: up={up}; give the direction of the upward axis, such as (0, 0, 1)")
     made = _read(estimate)
     if reference is None:
         reference = made.reference if isinstance(made, FinishedRun) else None
         if reference is None:
             raise SegslamError("evaluate: no ground truth; give `reference`")
     matched, truth = matched_poses(_poses(made), _poses(_read(reference)))
-    figures = scores(matched, truth, align=align, rpe_distance_m=rpe_distance_m, up=up)
+    x, y, z = (np.asarray(up) / np.linalg.norm(up)).tolist()
+    figures = scores(matched, truth, align=align, rpe_distance_m=rpe_distance_m, up=(x, y, z))
     if not figures:
         raise SegslamError(f"evaluate: only {len(matched)} poses match the reference; at least three are needed")
     return figures
@@ -53,10 +56,7 @@ def _read(given: Given) -> FinishedRun | Trajectory | PoseFile:
     if isinstance(given, str | Path):
         path = expanded(given)
         return read_run(path) if folder_of(path).is_dir() else read_poses(path)
-    poses = np.asarray(given, dtype=np.float64)
-    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
-        raise SegslamError(f"evaluate: poses of shape {poses.shape}; give finite matrices, (n, 4, 4)")
-    return PoseFile(poses, None)
+    return PoseFile(as_poses(given, "evaluate"), None)
 
 
 def _poses(known: FinishedRun | Trajectory | PoseFile) -> Trajectory | PoseFile:

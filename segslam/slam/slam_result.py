@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from segslam.core.evaluation import align_positions, trajectory_metrics
-from segslam.core.trajectory import Poses, camera_from_lidar, rows_of_same_scan, write_kitti, write_tum
+from segslam.core.trajectory import Poses, as_poses, camera_from_lidar, rows_of_same_scan, write_kitti, write_tum
 from segslam.core.types import (
     GraphEstimate,
     Indices,
@@ -160,9 +160,10 @@ class SlamResult(Record):
         if isinstance(reference, Trajectory):
             rows = rows_of_same_scan(own.scan_index, reference.scan_index)
             return own.T_world_lidar[rows[:, 0]], reference.T_world_lidar[rows[:, 1]]
-        if reference.shape != own.T_world_lidar.shape:
-            raise SegslamError(f"reference: an array of shape {reference.shape} for {len(own)} scans; give (n, 4, 4)")
-        return own.T_world_lidar, reference
+        truth = as_poses(reference, "reference")
+        if len(truth) != len(own):
+            raise SegslamError(f"reference: {len(truth)} poses for {len(own)} scans; give one for each, (n, 4, 4)")
+        return own.T_world_lidar, truth
 
 
 def outcome_text(attempt: LoopAttempt, closure_weights: Mapping[tuple[int, int], float]) -> str:

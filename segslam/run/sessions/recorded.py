@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from segslam.core.errors import counted
 from segslam.core.trajectory import Poses
 from segslam.core.types import (
     CloudOf,
@@ -112,7 +113,7 @@ def read_session(folder: Path) -> Session:
 def read_sessions(folders: list[Path]) -> list[Session]:
     """The sessions of several runs, in their order. Raises SegslamError for fewer than two, or one given twice."""
     if len(folders) < 2:
-        raise SegslamError(f"{len(folders)} run given; give two or more")
+        raise SegslamError(f"{counted(len(folders), 'run')} given; give two or more")
     logs = [log_of(folder).resolve() for folder in folders]
     for number, folder in enumerate(folders):
         if logs[number] in logs[:number]:

@@ -6,6 +6,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from time import perf_counter
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from segslam.candidates import PlaceCandidate, Places, PlaceSignature, signature_of, signatures_around
@@ -19,6 +20,7 @@ from segslam.core.types import (
     Points,
     Rejected,
     RejectReason,
+    SegslamError,
     Transform,
     as_labels,
     as_points,
@@ -87,8 +89,10 @@ class Locator:
 
         `labels`: learning ids, one per point; without labels, geometric labels are computed. At most `max_places`, the
         most similar ones, are tried; if more than `NUM_FIRST`, also for views from points around the sensor. Raises
-        SegslamError for arrays of another shape.
+        SegslamError for arrays of another shape, and for a number of places that is none.
         """
+        if not isinstance(max_places, int | np.integer) or max_places < 0:
+            raise SegslamError(f"max_places={max_places}: give a number of places, such as {MAX_PLACES}")
         started = perf_counter()
         config = self.config
         near = as_points(points)

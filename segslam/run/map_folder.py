@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from segslam.core.config import Config, OdometryConfig, check_config
+from segslam.core.errors import brief
 from segslam.core.trajectory import read_poses
 from segslam.core.types import BadScan, SegslamError, Step, Trajectory
 from segslam.core.whole_files import expanded
@@ -53,6 +54,8 @@ def map_folder(
     naming the file and the remedy, also if no scan remains.
     """
     check_config(config)
+    if not isinstance(odometry, Odometry | None):
+        raise SegslamError(f"odometry: {brief(str(odometry))} is not an Odometry; for a file: segslam map --odometry")
     source = DataSource(expanded(data), sequence, dataset, labels, encoding, frames, topic)
     scans = open_scans(source, config or Config())
     config = in_effect(config or preset(preset_for(extent_m(scans))), scans.vertical_angle_deg)

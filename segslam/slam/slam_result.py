@@ -25,6 +25,7 @@ from segslam.core.types import (
     Vector,
     probability_text,
 )
+from segslam.core.whole_files import check_target, expanded
 from segslam.odometry.motion_model import information_of
 from segslam.slam.adjustment import Adjusted
 
@@ -86,12 +87,15 @@ class SlamResult(Record):
 
     def to_tum(self, path: str | Path) -> None:
         """Write the corrected LiDAR poses of all scans in TUM format: seconds x y z qx qy qz qw."""
-        write_tum(Path(path), self.trajectory.stamp_ns, self.trajectory.T_world_lidar)
+        file = expanded(path)
+        check_target(file)
+        write_tum(file, self.trajectory.stamp_ns, self.trajectory.T_world_lidar)
 
     def to_kitti(self, path: str | Path, *, T_camera_lidar: Transform | None = None) -> None:
         """Write the corrected poses in KITTI format, 12 numbers per line; camera poses if a calibration is given."""
-        poses = self.trajectory.T_world_lidar
-        write_kitti(Path(path), poses if T_camera_lidar is None else camera_from_lidar(poses, T_camera_lidar))
+        file, poses = expanded(path), self.trajectory.T_world_lidar
+        check_target(file)
+        write_kitti(file, poses if T_camera_lidar is None else camera_from_lidar(poses, T_camera_lidar))
 
     def errors(self, reference: Trajectory | Poses) -> dict[str, float]:
         """Errors against ground-truth LiDAR poses in any frame: `ate_m` and the other figures of `metrics.json`.

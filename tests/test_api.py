@@ -159,6 +159,7 @@ def test_a_run_is_evaluated_exported_and_reported_by_public_names(made: MadeRun,
     with pytest.raises(segslam.SegslamError, match=r"give finite matrices, \(n, 4, 4\)"):
         segslam.evaluate(np.full((5, 4, 4), np.nan), made.truth.T_world_lidar)
     assert segslam.report(str(made.folder)) == made.folder / "report.html"
+    assert segslam.report(made.folder / "log.mcap") == made.folder / "report.html"
     assert segslam.export(made.folder, tmp_path / "map.ply")["num_map_points"] > 0
     assert (tmp_path / "map.ply").is_file()
     with pytest.raises(segslam.SegslamError, match="given twice"):
@@ -184,6 +185,8 @@ WRONG_KINDS = {
     "segslam.merge([], 'run')": "0 runs given",
     "segslam.register(np.ones((3, 3)), np.ones((3, 3)), config='x.yaml')": "x.yaml is not a Config",
     "segslam.load_config(5)": "5: not a path",
+    "segslam.load_config(base='x.yaml')": "x.yaml is not a Config",
+    "segslam.Locator(made)": "is not a Session; for a run: Locator.from_run(FOLDER)",
     "segslam.open_dataset(5)": "5: not a path",
     "segslam.open_dataset(None)": "None: not a path",
     "segslam.map_folder(5, 'run')": "5: not a path",

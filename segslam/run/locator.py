@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from segslam.candidates import PlaceCandidate, Places, PlaceSignature, signature_of, signatures_around
 from segslam.core.config import Config
+from segslam.core.errors import brief
 from segslam.core.points import within_range
 from segslam.core.threads import at_once
 from segslam.core.types import (
@@ -67,6 +68,8 @@ class Locator:
 
     def __init__(self, session: Session, config: Config | None = None) -> None:
         """`session`: the run; `config`: settings, by default its own. Signatures that it does not have are computed."""
+        if not isinstance(session, Session):
+            raise SegslamError(f"Locator: {brief(str(session))} is not a Session; for a run: Locator.from_run(FOLDER)")
         self.session = session
         self.config = config or session.run.config
         self.submaps = submaps_of(session, self.config)

@@ -123,6 +123,7 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = (), *
 
     Raises SegslamError, naming the file and key, for unreadable YAML, unknown keys and values out of range.
     """
+    check_config(base)
     values = base.model_dump(mode="json") if base else {}
     given = _parse_yaml(read_text(expanded(path), "configuration", "give a YAML file"), str(path)) if path else {}
     for name, section in given.items():

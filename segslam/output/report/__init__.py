@@ -10,6 +10,7 @@ import matplotlib
 from segslam.core.processes import in_parts
 from segslam.core.whole_files import expanded, write_whole
 from segslam.output.finished import FinishedRun, read_run
+from segslam.output.folder import folder_of
 from segslam.output.log import read_log
 from segslam.output.map.before_after import BeforeAfter
 from segslam.output.map.from_above import small_png
@@ -26,11 +27,11 @@ MOST_KEYFRAMES = 500
 
 
 def write_report(folder: str | Path) -> Path:
-    """Write `report.html` into a run folder, from the files there; returns its path.
+    """Write `report.html` into a run folder, given it or its log, from the files there; returns its path.
 
     Raises SegslamError if the folder contains no finished run, or cannot be written.
     """
-    folder = expanded(folder)
+    folder = folder_of(expanded(folder))
     run = read_run(folder)
     log = read_log(folder)
     drawings: list[Callable[[FinishedRun], Any]] = [_plots, _pictures]

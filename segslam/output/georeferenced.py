@@ -56,6 +56,8 @@ def georeference(
     """
     if str(use) not in set(Use):
         raise SegslamError(f"georeference: use {use!r}: unknown; known: {', '.join(Use)}")
+    if not np.isfinite(offset_s):
+        raise SegslamError(f"georeference: offset_s={offset_s}; give a difference of clocks in seconds")
     finished = read_run(run)
     known = fixes if isinstance(fixes, Fixes) else read_fixes(fixes)
     scans = finished.result.trajectory

@@ -326,6 +326,8 @@ def test_a_place_is_refused_with_the_reason(made: MadeRun, tmp_path: Path, capsy
     fixes = made.folder.parent / "fixes.csv"
     assert run("georeference", made.folder, "--gnss", fixes, "--gnss-offset", "nan") == 2
     assert "--gnss-offset nan: not a difference of clocks" in capsys.readouterr().err
+    with pytest.raises(SegslamError, match="offset_s=nan; give a difference of clocks in seconds"):
+        georeference(made.folder, fixes, offset_s=float("nan"))
     with pytest.raises(SegslamError, match="use 'bend': unknown; known: align, fuse"):
         georeference(made.folder, fixes, use="bend")
 

@@ -80,6 +80,7 @@ def test_the_key_changes_with_recording_options_and_version_but_not_with_the_nam
         ("whole/velodyne", "whole/labels/0.label"),
         ("whole/velodyne", "whole/times.txt"),
         ("whole/velodyne", "whole/poses.txt"),
+        ("sequences/00", "poses/00.txt"),
         ("os1.pcap", "os1.json"),
     ],
 )
@@ -92,7 +93,9 @@ def test_the_key_changes_with_linked_folders_and_what_is_beside_the_data(
     (tmp_path / "linked").mkdir()
     (tmp_path / "linked" / "velodyne").symlink_to(tmp_path / "whole" / "velodyne")
     (tmp_path / "whole" / "velodyne" / "again").symlink_to(tmp_path / "linked")  # a circle
-    for name in ("os1.pcap", "os1.json"):
+    (tmp_path / "sequences" / "00").mkdir(parents=True)
+    (tmp_path / "poses").mkdir()
+    for name in ("poses/00.txt", "os1.pcap", "os1.json"):
         (tmp_path / name).write_bytes(b"1")
     (drive,) = drives_of([tmp_path / data])
     key = drive.key("1")

@@ -51,6 +51,8 @@ class Drive:
         if data.name == "velodyne":
             folder = "labels" if self.labels == "auto" else self.labels
             beside = [data.parent / name for name in (folder, "times.txt", "poses.txt")]
+        if data.parent.name == "sequences":
+            beside = [data.parent.parent / "poses" / f"{data.name}.txt"]  # true poses of KITTI's layout
         files += [str(file) for file in beside if file.exists()]
         labels = Path(self.labels.removeprefix(NETWORK))
         files += [str(labels)] if labels.is_absolute() and labels.exists() else []  # others are in the recording

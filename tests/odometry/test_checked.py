@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.drives import STEP_M, round_drive, round_sweeps
+from scipy.linalg import eigh
 
 from segslam.core import geometry
 from segslam.core.config import Config, load_config
@@ -601,6 +602,19 @@ def test_a_motion_has_information_of_its_own_if_it_is_less_certain_than_the_mode
     own = odometry._own_information(along)
     assert own is not None
     assert np.linalg.inv(own)[3, 3] == pytest.approx(1.0, rel=0.1)
+
+
+def test_a_motion_is_as_uncertain_in_each_direction_as_the_scan_or_the_model_whichever_is_more() -> None:
+    """Directions in which both rotation and translation are uncertain: their variances relative to the model's."""
+    odometry = _checked(round_drive()[1].T_world_lidar)
+    step = geometry.transform(np.eye(3), np.array([CONFIG.keyframes.distance_m, 0.0, 0.0]))
+    shared = geometry.tangent(rotation_rad=np.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M)
+    model = np.linalg.inv(odometry_information(0.0, step, CONFIG.graph)) + np.diag(shared**2)
+    turn = np.linalg.qr(np.random.default_rng(0).standard_normal((6, 6)))[0]
+    root = np.sqrt(model) @ turn
+    own = odometry._own_information(root @ np.diag([9.0, 4.0, 1.0, 0.5, 0.1, 0.01]) @ root.T)
+    assert own is not None
+    np.testing.assert_allclose(eigh(np.linalg.inv(own), model, eigvals_only=True), [1.0] * 4 + [4.0, 9.0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("state", [MotionState.CONFIRMED, MotionState.REFINED])

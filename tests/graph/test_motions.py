@@ -152,6 +152,16 @@ def test_false_closures_do_not_win_a_break() -> None:
     assert {pair for pair, weight in found.closure_weights.items() if weight == 1.0} == set(BEFORE + ACROSS)
 
 
+def test_a_false_closure_that_comes_first_does_not_hold_the_drive_after_a_break() -> None:
+    T_break = geometry.transform(geometry.yaw(2.0), [10.0, 0.0, 0.0])
+    graph = graph_of(odometry(0, {AT: T_break}), [], unknown=(AT + 1,))
+    for loop in [OUTLIERS[1], *true_closures(ACROSS, 0)]:
+        graph.add_closure(loop)
+        running = graph.optimize()
+    assert running.closure_weights[135, 20] < 0.01
+    assert ate_m(running) < 1.0
+
+
 def test_a_segment_without_closures_follows_the_one_before() -> None:
     T_odom = odometry(0, {40: JUMP})
     found = graph_of(T_odom, true_closures([(12, 3)], 0), unknown=(41,)).finish()

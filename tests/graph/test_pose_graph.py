@@ -548,6 +548,21 @@ def test_placements_in_a_map_have_the_weights_of_their_keyframes() -> None:
     np.testing.assert_allclose(estimate.T_world_keyframe[0][:3, 3], [5.0, 0.0, 0.0], atol=1e-3)
 
 
+def test_the_first_placement_in_a_map_is_used_at_once_and_later_ones_in_groups(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("segslam.graph.anchored.OPTIMIZE_EVERY", 3)
+    graph, used_at = AnchoredGraph(CONFIG), []
+    known = true_closure(np.tile(np.eye(4), (2, 1, 1)), 1, 0)
+    for number in range(8):
+        T_odom = geometry.transform(np.eye(3), [2.0 * number, 0.0, 0.0])
+        graph.add_keyframe(number, T_odom, 2.0 * number)
+        assert not graph.is_due
+        graph.place(Placement(number, 7, T_odom, known.information, known.alignment, is_found=True))
+        if graph.is_due:
+            graph.optimize()
+            used_at.append(number)
+    assert used_at == [0, 3, 6]
+
+
 def test_a_rejected_jump_of_the_odometry_is_no_drift() -> None:
     """A loop across it, confirmed after the final optimisation, does not make the odometry less certain."""
     truth = circle(240)

@@ -8,7 +8,7 @@ import pytest
 
 from segslam.core import geometry
 from segslam.core.config import GraphConfig
-from segslam.graph import gnc
+from segslam.graph import gnc, levenberg_marquardt
 from segslam.graph.closure_pairs import consistent_pairs, largest_consistent, neighbours
 from segslam.graph.edges import Edge, factor_graph
 from segslam.graph.gnc import TruncatedProblem, select_consistent, settle, settle_from
@@ -63,6 +63,30 @@ def test_false_closures_that_outnumber_the_true_ones_of_their_place_are_rejected
     found = select_consistent(problem, misled.search.values, agree, near)
     assert found.weights.tolist() == [1.0] * len(TRUE) + [0.0] * len(FALSE)
     assert found.truncated_cost < misled.truncated_cost
+
+
+def test_the_iterations_of_graduated_non_convexity_are_all_linear_systems_solved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem, truth, _, _ = problem_of(TRUE + FALSE)
+    of_other_start = settle(problem, truth).search.iterations
+    solved: list[int] = []
+
+    def step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+        solved.append(1)
+        return levenberg_marquardt.step(graph, values)
+
+    def search(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> levenberg_marquardt.Search:
+        found = levenberg_marquardt.search(graph, start)
+        solved.append(found.iterations)
+        return found
+
+    monkeypatch.setattr(gnc, "step", step)
+    monkeypatch.setattr(gnc, "search", search)
+    monkeypatch.setattr(gnc, "better", lambda graduated, _: graduated)
+    iterations = gnc.solve(problem, truth).search.iterations
+    assert len(solved) > 5
+    assert iterations == sum(solved) - of_other_start
 
 
 def test_without_false_closures_none_is_rejected() -> None:

@@ -928,6 +928,25 @@ def test_a_map_before_a_break_is_used_again_if_it_explains_the_scan_better(is_be
     assert (odometry._map is before) is is_better
 
 
+@pytest.mark.long
+def test_a_map_before_a_break_is_found_again_where_the_motion_before_it_leads() -> None:
+    """The sensor moves nine metres a scan; one scan shows another place, and the odometry is far off since then."""
+    scans, truth = round_drive()
+    odometry = _checked(truth.T_world_lidar)
+    last = _registered(odometry, scans[:SLIP_AT])[-1].T_odom_lidar
+    before, odometry._map = odometry._map, LocalMap(CONFIG.refine)
+    T_step, T_two_steps = (
+        geometry.inverse(truth.T_world_lidar[SLIP_AT - 1]) @ truth.T_world_lidar[SLIP_AT - 1 + num] for num in (4, 8)
+    )
+    odometry._lost = before, T_step, 0
+    far_off = last @ geometry.transform(geometry.yaw(2.0), [0.0, -40.0, 0.0])
+    scan = SeenScan(scans[SLIP_AT + 7].points, CONFIG.refine)
+    found = odometry._rejoined(Proposed(scan, far_off, far_off, 1.0), [])
+    assert found is not None
+    T_last_found = geometry.inverse(last) @ before.T_odom_map @ found[1][0].T_map_lidar
+    assert geometry.distance(geometry.inverse(T_two_steps) @ T_last_found) < 0.1
+
+
 def test_an_odometry_that_reports_no_motion_is_checked_too() -> None:
     scans, truth = round_drive()
     standing = [replace(scans[0], index=row, stamp_ns=row * 100_000_000) for row in range(21)]

@@ -45,7 +45,7 @@ class KissAligner:
         self._alone.append(_registered(self._first, points, T_last_predicted))
 
     def alone(self) -> list[Transform]:
-        """The pose of each sweep passed to `align_alone`."""
+        """The pose of each sweep passed to `align_alone`, and those that the caller adds."""
         return self._alone
 
 

@@ -23,9 +23,9 @@ MOST_SHARED = 2**18
 class OdometryApart(KissOdometry):
     """`KissOdometry` in a separate process; while it aligns a scan, other threads of this process run.
 
-    Its process starts at once. Call `close`, or leave the `with` block, after the last scan. Every method raises
-    SegslamError if the process has ended. The process imports the main script, as with every spawned process: a script
-    that uses this class needs `if __name__ == "__main__":`.
+    Its process starts at once. Leave the `with` block after the last scan. Every method raises SegslamError if the
+    process has ended. The process imports the main script, as with every spawned process: a script that uses this class
+    needs `if __name__ == "__main__":`.
     """
 
     def __init__(self, config: OdometryConfig, *, keeps_alone: bool = False) -> None:
@@ -40,7 +40,10 @@ class OdometryApart(KissOdometry):
         super().__init__(config, self._apart, keeps_alone=self._keeps_alone)
 
     def foresee(self, scan: Scan, *, gap: float) -> None:
-        """Begin to align the next scan, as if the pose of this one stays; `follow` discards the result."""
+        """Begin to align the next scan, `gap` intervals after this one, as if the pose of this one stays.
+
+        It is aligned while this one is checked; `follow` discards the result.
+        """
         with suppress(BadScan):  # `register` raises it
             swept = deskew_scan(scan, self._T_last_lidar, self._config)
             self._apart.begin_to_align(swept[0], geometry.scaled(self._T_last_lidar, gap))
@@ -51,7 +54,7 @@ class OdometryApart(KissOdometry):
         if self._foreseen is not None:
             T_discarded, self._foreseen = self._apart.begun(), None
             if self._keeps_alone and not self._has_followed:  # KISS-ICP alone has aligned the next scan with this
-                self._before_following.append(T_discarded)
+                self.alone().append(T_discarded)
                 self._is_alone_known = True
         super().follow(scans, T_odom_lidar, T_before_lidar)
 
@@ -65,9 +68,6 @@ class OdometryApart(KissOdometry):
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
         """End the process; no results are lost."""
         self._apart.close()
 

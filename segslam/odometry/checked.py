@@ -15,6 +15,7 @@ import math
 from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from statistics import median
 from typing import NamedTuple
 
 import numpy as np
@@ -26,16 +27,19 @@ from segslam.core.probabilities import SIGNIFICANT
 from segslam.core.types import Information, Motion, MotionState, Scan, Transform
 from segslam.graph.edges import BREAK_M
 from segslam.graph.noise import odometry_information
+from segslam.odometry.apart import OdometryApart
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import LocalMap, SeenScan
-from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, is_usual
+from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel
 from segslam.odometry.search import PoseSearch, Recover
-from segslam.odometry.sweep import Foreseeing, Odometry, OdometryResult
+from segslam.odometry.sweep import Odometry, OdometryResult
 from segslam.registration.refinement import MIN_POINTS, SHARED_NOISE_DEG, SHARED_NOISE_M
 
 ELSEWHERE_M = 30.0
 ANYWHERE = geometry.tangent(rotation_rad=np.radians(60.0), translation_m=ELSEWHERE_M)
 """Chosen: standard deviations of a motion that no pose explains: the sensor may have been carried anywhere nearby."""
+SHARED = np.diag(geometry.tangent(rotation_rad=math.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M) ** 2)
+"""Covariance of the errors that all points of a scan have in common."""
 MOST_OFF = float(chi2.isf(SIGNIFICANT, 6))
 """Chi-square above which a pose of the odometry is significantly off the registered one."""
 MOST_OFF_TOGETHER = float(chi2.isf(SIGNIFICANT, 6 * WINDOW))
@@ -63,8 +67,6 @@ class CheckedOdometry:
         """`recover` registers two clouds without initial guess."""
         self._inner = inner
         self._config = config
-        self._refine = config.refine
-        self._shared = geometry.tangent(rotation_rad=math.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M)
         self._map = LocalMap(config.refine)
         self._recover = recover
         self._lost: tuple[LocalMap, Transform, int] | None = None
@@ -90,13 +92,13 @@ class CheckedOdometry:
         gap = max(gap, self._intervals.gap(scan.stamp_ns))
         proposed = self._inner.register(scan, gap=gap)
         self._intervals.note(scan.stamp_ns)
-        if ahead is not None and ahead.stamp_ns > scan.stamp_ns and isinstance(self._inner, Foreseeing):
+        if ahead is not None and ahead.stamp_ns > scan.stamp_ns and isinstance(self._inner, OdometryApart):
             self._inner.foresee(ahead, gap=self._intervals.gap(ahead.stamp_ns))
         if not self._config.health.check:
             return proposed
         is_watched = self._is_watched
         T_odom_predicted = self._T_odom_last @ self._motion.predicted(gap)
-        seen = SeenScan(proposed.points, self._refine)
+        seen = SeenScan(proposed.points, self._config.refine)
         T_odom_lidar, motion = self._checked(
             Proposed(seen, self._T_odom_inner @ proposed.T_odom_lidar, T_odom_predicted, gap)
         )
@@ -123,11 +125,8 @@ class CheckedOdometry:
         if len(self._map) == 0:
             self._map.add(proposed.T_odom_lidar, proposed.scan)
             return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
-        if not self._is_watched and proposed.gap == 1.0:
-            confirmed = self._confirmed(proposed)
-            if confirmed is not None:
-                return confirmed
-        return self._registered(proposed)
+        confirmed = None if self._is_watched or proposed.gap > 1.0 else self._confirmed(proposed)
+        return confirmed or self._registered(proposed)
 
     def _is_due(self, proposed: Proposed) -> bool:
         """True if the motion is as long as a keyframe's since the last checked scan, or unlike the last motion."""
@@ -136,16 +135,13 @@ class CheckedOdometry:
         moments = proposed.scan.moments
         moved_m = geometry.displacement_m(moments, proposed.T_odom_lidar, self._map.T_odom_map)
         sudden_m = geometry.displacement_m(moments, proposed.T_odom_lidar, proposed.T_odom_predicted)
-        return moved_m >= self._config.keyframes.distance_m or sudden_m >= self._refine.voxel_m
+        return moved_m >= self._config.keyframes.distance_m or sudden_m >= self._map.voxel_m
 
     def _confirmed(self, proposed: Proposed) -> tuple[Transform, Motion] | None:
         """The proposed pose, if a few steps to the last checked scan leave it and fit as usual; else None."""
         T_map_proposed = self._map.pose_of(proposed.T_odom_lidar)
         found = self._map.check(proposed.scan, T_map_proposed)
-        if found is None:
-            return None
-        off = _off(found.T_map_lidar, self._covariance(found), T_map_proposed)
-        if off > MOST_OFF:
+        if found is None or (off := _off(found.T_map_lidar, self._covariance(found), T_map_proposed)) > MOST_OFF:
             return None
         fits_as_usual = _fits_as_usual(found, self._last_checks)
         self._last_checks.append(found.mean_log)
@@ -197,7 +193,7 @@ class CheckedOdometry:
             T_odom_lidar = proposed.T_odom_lidar
         if is_lost:
             self._lost = self._lost or (self._map, T_step_before, 0)
-            self._map = LocalMap(self._refine)
+            self._map = LocalMap(self._config.refine)
             self._motion.begin_map()
         self._map.add(T_odom_lidar, scan)
         self._follow(state, T_odom_lidar)
@@ -326,17 +322,13 @@ class CheckedOdometry:
         is_repaired = is_off and (is_watched or is_unlikely)
         if is_repaired or is_break:
             self._offs.clear()
-        else:
-            self._offs.append(off)
-        if is_break:
-            return MotionState.BROKEN
-        if is_repaired:
-            return MotionState.REPAIRED
+            return MotionState.BROKEN if is_break else MotionState.REPAIRED
+        self._offs.append(off)
         return MotionState.REFINED if is_watched or is_off else MotionState.CONFIRMED
 
     def _covariance(self, fit: Fit) -> Information:
         """Covariance of a registered pose: of its likelihood, `ANYWHERE` at most, and of errors of all points."""
-        return np.linalg.inv(fit.information + np.diag(ANYWHERE**-2.0)) + np.diag(self._shared**2)
+        return np.linalg.inv(fit.information + np.diag(ANYWHERE**-2.0)) + SHARED
 
     def _result(
         self, state: MotionState, T_map_proposed: Transform, fit: Fit, covariance: Information | None
@@ -357,7 +349,7 @@ class CheckedOdometry:
     def _own_information(self, covariance: Information) -> Information | None:
         """Information of a motion that is less certain than the graph's noise model of odometry; else None."""
         step = geometry.transform(np.eye(3), np.array([self._config.keyframes.distance_m, 0.0, 0.0]))
-        model = np.linalg.inv(odometry_information(0.0, step, self._config.graph)) + np.diag(self._shared**2)
+        model = np.linalg.inv(odometry_information(0.0, step, self._config.graph)) + SHARED
         whiten = np.diag(np.diag(model) ** -0.5)
         excess, directions = np.linalg.eigh(whiten @ (covariance - model) @ whiten)
         if excess[-1] <= 0.0:
@@ -367,7 +359,16 @@ class CheckedOdometry:
 
 
 def _fits_as_usual(fit: Fit, last: Collection[float]) -> bool:
-    return is_usual(fit.mean_log, last, least_spread=fit.num_patches**-0.5)
+    """True if a pose explains its scan at most three standard deviations worse than the median of the last ones.
+
+    The standard deviation is that of a normal distribution with the same median absolute deviation, and at least that
+    of the mean of the patches. False if nothing is known of the last ones.
+    """
+    if not last:
+        return False
+    middle = median(last)
+    spread = 1.4826 * median(abs(other - middle) for other in last)
+    return fit.mean_log >= middle - 3.0 * max(spread, fit.num_patches**-0.5)
 
 
 def _is_significant(search: PoseSearch, fit: Fit, other: Fit) -> bool:

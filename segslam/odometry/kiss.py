@@ -1,6 +1,5 @@
 """KISS-ICP (Vizzo et al., RA-L 2023), using the package of its authors."""
 
-from collections.abc import Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -26,7 +25,6 @@ class KissOdometry:
         self._config = config
         self._aligner = aligner or KissAligner(kiss_config(config))
         self._keeps_alone, self._has_followed = keeps_alone, False
-        self._before_following: list[Transform] = []
         self._is_alone_known = False
         """True if the pose of the next scan by KISS-ICP alone is kept already."""
         self._last_gap = 1.0
@@ -55,18 +53,18 @@ class KissOdometry:
         self._aligner.follow(scans, T_odom_lidar)
         self._T_odom_last, self._T_last_lidar = T_odom_lidar, T_before_lidar
 
-    def alone(self) -> Sequence[Transform]:
+    def alone(self) -> list[Transform]:
         """The pose of each scan by KISS-ICP alone, without corrections by `follow`; empty if they are not kept."""
-        return [*self._before_following, *self._aligner.alone()]
+        return self._aligner.alone()
 
     def _register_alone(self, scan: Scan, points: Points, T_odom_lidar: Transform, gap: float) -> None:
         """Keep the pose by KISS-ICP alone; `points` and the pose are those of the scan here."""
         if not self._has_followed:
-            self._before_following.append(T_odom_lidar)
+            self.alone().append(T_odom_lidar)
         elif self._is_alone_known:
             self._is_alone_known = False
         else:
-            before, last = [np.eye(4), np.eye(4), *self.alone()][-2:]
+            before, last = [np.eye(4), np.eye(4), *self.alone()[-2:]][-2:]
             T_last_lidar = geometry.scaled(_since(before, last), 1 / self._last_gap)
             with suppress(BadScan):
                 points = deskew_scan(scan, T_last_lidar, self._config)[0]

@@ -132,10 +132,9 @@ class LocalMap:
         """The surface of all scans as far from the newest one as a scan reaches, in its frame; cached."""
         if self._surface is None:
             clouds = [self._in_map(thinned, T_odom_lidar) for T_odom_lidar, thinned in self._scans]
-            merged = clouds[0]
             if len(clouds) > 1:
-                merged = voxel_means(np.vstack(clouds), self.voxel_m, within_m=refinement.MAX_RANGE_M)
-            self._surface = refinement.make_surface(merged.astype(np.float32), config=self._config)
+                clouds = [voxel_means(np.vstack(clouds), self.voxel_m, within_m=refinement.MAX_RANGE_M)]
+            self._surface = refinement.make_surface(clouds[0].astype(np.float32), config=self._config)
         return self._surface
 
     @property

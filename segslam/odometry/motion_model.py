@@ -9,7 +9,7 @@ the change is large.
 
 import math
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from statistics import median
 
 import numpy as np
@@ -49,19 +49,6 @@ class Intervals:
         if self._last_ns is not None and stamp_ns > self._last_ns:
             self._intervals_s.append((stamp_ns - self._last_ns) * 1e-9)
         self._last_ns = stamp_ns
-
-
-def is_usual(value: float, last: Collection[float], *, least_spread: float) -> bool:
-    """True if a value is not below the median of the last ones by more than three standard deviations.
-
-    The standard deviation is that of a normal distribution with the same median absolute deviation. False if no value
-    is known.
-    """
-    if not last:
-        return False
-    middle = median(last)
-    spread = 1.4826 * median(abs(other - middle) for other in last)
-    return value >= middle - 3.0 * max(spread, least_spread)
 
 
 class MotionModel:
@@ -123,9 +110,7 @@ class MotionModel:
         It is 0 while nothing is known of the motion.
         """
         prior = self._predicted_covariance(gap)
-        if prior is None:
-            return 0.0
-        return geometry.chance_beyond(reach_m, prior)
+        return 0.0 if prior is None else geometry.chance_beyond(reach_m, prior)
 
     def fused(self, T_last_lidar: Transform, measured: Information, gap: float) -> tuple[Transform, Information]:
         """The most likely motion since the last scan, given a measured one with its covariance and the prediction.

@@ -64,8 +64,7 @@ class PoseSearch:
         reached = [self._local.approach(self._scan, T_map_start) for T_map_start in starts]
         found = [*known, *(self._with_prior(fit) for fit in reached if fit is not None)]
         found = self._compared(found, num_ordered=NUM_REGISTERED + len(known))
-        T_map_known = [fit.T_map_lidar for fit in known]
-        others = [fit.T_map_lidar for fit in found if not any(fit.T_map_lidar is other for other in T_map_known)]
+        others = [fit.T_map_lidar for fit in found if all(fit.T_map_lidar is not one.T_map_lidar for one in known)]
         return self._compared([*found, *self._registered(others[:NUM_REGISTERED])])
 
     def without_guess(self, recover: Recover) -> list[Fit]:
@@ -108,8 +107,7 @@ class PoseSearch:
         return covariance / total
 
     def _registered(self, starts: Iterable[Transform]) -> list[Fit]:
-        fits = [fit for T_map_start in starts for fit in self._local.register(self._scan, T_map_start)]
-        return [self._with_prior(fit) for fit in fits]
+        return [self._with_prior(fit) for T_map in starts for fit in self._local.register(self._scan, T_map)]
 
     def _with_prior(self, fit: Fit) -> Fit:
         return replace(fit, log_prior=self._prior(fit))

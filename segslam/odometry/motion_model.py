@@ -59,7 +59,7 @@ class MotionModel:
         """Motion per interval of the sensor."""
         self._covariance: Information | None = None
         self._accumulated = np.zeros((6, 6))
-        """Covariance of the error of the position since the last observation with that of the motion."""
+        """Covariance of the error of the position since the last observation with that of the motion per interval."""
         self._unseen: deque[Information] = deque(maxlen=MAP_SCANS)
         """Covariances of the motions that the scans of the map did not show, as tangents of the last scan."""
         self._changes: deque[np.ndarray] = deque(maxlen=WINDOW)
@@ -131,8 +131,8 @@ class MotionModel:
             self._changes.append(geometry.log(geometry.inverse(self.T_step) @ T_last_lidar))
         left = np.eye(6) - gain
         posterior = _posterior(gain, prior, measured)
-        carried = np.zeros((6, 6)) if prior is None else self._accumulated @ left.T
-        self._covariance, self._accumulated = posterior / gap**2, carried + posterior
+        carried = np.zeros((6, 6)) if prior is None else gap * self._accumulated @ left.T
+        self._covariance, self._accumulated = posterior / gap**2, (carried + posterior) / gap
         added, directions = eigh(carried + carried.T, posterior)
         half = posterior @ directions
         total = posterior + (half * np.maximum(added, 0.0)) @ half.T  # errors that cancel may not be counted on

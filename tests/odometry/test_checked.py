@@ -851,19 +851,32 @@ def test_a_turn_that_a_scan_shows_does_not_make_a_slide_credible_that_it_does_no
     assert seen[1, 3] == pytest.approx(3.0, abs=0.01), "a slide that the scan shows is kept, however large"
 
 
-def test_errors_of_motions_that_scans_do_not_show_add_up_to_that_of_the_position() -> None:
+@pytest.mark.parametrize("gaps", [[1.0] * 10, [1.0, 1.0, 5.0, 1.0, 1.0], [10.0, 1.0, 1.0], [1.0, 1.0, 1.0, 10.0]])
+def test_errors_of_motions_that_scans_do_not_show_add_up_to_that_of_the_position(gaps: list[float]) -> None:
     """Along a tunnel the speed before is all that is known: its error is that of each motion."""
     model = MotionModel()
     for step_m in np.random.default_rng(0).normal(0.3, 0.02, 20):
         model.update(geometry.transform(np.eye(3), [step_m, 0.0, 0.0]), 1e-4 * np.eye(6), 1.0)
     measured = np.diag([*3 * [1e-4], 1e6, 1e-4, 1e-4])
     of_speed, added = [], []
-    for _ in range(10):
-        T_last_lidar = model.predicted(1.0)
-        of_speed.append(model.fused(T_last_lidar, measured, 1.0)[1][3, 3])
-        added.append(model.update(T_last_lidar, measured, 1.0)[1][3, 3])
-    of_position = sum(min(a, b) for a in of_speed for b in of_speed)  # two speeds share the error of the earlier one
+    for gap in gaps:
+        T_last_lidar = model.predicted(gap)
+        of_speed.append((gap, model.fused(T_last_lidar, measured, gap)[1][3, 3] / gap**2))
+        added.append(model.update(T_last_lidar, measured, gap)[1][3, 3])
+    of_position = sum(m * n * min(a, b) for m, a in of_speed for n, b in of_speed)  # speeds share the earlier's error
     assert sum(added) == pytest.approx(of_position, rel=0.02), "and a little by the last one that was shown"
+
+
+def test_errors_before_a_motion_that_is_known_are_not_those_of_later_ones() -> None:
+    model = MotionModel()
+    for step in np.random.default_rng(0).normal([0.0, 0.0, 0.0, 0.3, 0.0, 0.0], 0.02, (20, 6)):
+        model.update(geometry.exp(step), 1e-4 * np.eye(6), 1.0)
+    measured = np.diag([*3 * [1e-4], 1e6, 1e-4, 1e-4])
+    for _ in range(5):
+        model.update(model.predicted(1.0), measured, 1.0)
+    model.restart(geometry.transform(np.eye(3), [0.3, 0.0, 0.0]))
+    own = model.fused(model.predicted(1.0), measured, 1.0)[1]
+    np.testing.assert_allclose(model.update(model.predicted(1.0), measured, 1.0)[1], own, atol=1e-12)
 
 
 @pytest.mark.parametrize("is_seen", [True, False])

@@ -69,9 +69,9 @@ class CheckedOdometry:
         self._config = config
         self._map = LocalMap(config.refine)
         self._recover = recover
-        self._lost: tuple[LocalMap, Transform, int] | None = None
-        """The map before a break, in which the next scans are tried, the motion per interval there, and the number of
-        scans since then."""
+        self._lost: tuple[LocalMap, Transform, float] | None = None
+        """The map before a break, in which the next scans are tried, the motion per interval there, and the intervals
+        since then."""
         self._intervals = Intervals()
         self._motion = MotionModel()
         self._last_checks: deque[float] = deque(maxlen=WINDOW)
@@ -192,7 +192,7 @@ class CheckedOdometry:
         if state is MotionState.CONFIRMED:
             T_odom_lidar = proposed.T_odom_lidar
         if is_lost:
-            self._lost = self._lost or (self._map, T_step_before, 0)
+            self._lost = self._lost or (self._map, T_step_before, gap)
             self._map = LocalMap(self._config.refine)
             self._motion.begin_map()
         self._map.add(T_odom_lidar, scan)
@@ -288,15 +288,16 @@ class CheckedOdometry:
         """
         if self._lost is None:
             return None
-        local, T_step, num_scans = self._lost
+        local, T_step, since = self._lost
+        since += proposed.gap
         search = PoseSearch(local, proposed.scan)
-        T_continued = geometry.scaled(T_step, num_scans + 2.0)
+        T_continued = geometry.scaled(T_step, since)
         by_odometry = [local.pose_of(T) for T in (proposed.T_odom_lidar, proposed.T_odom_predicted)]
         fits = search.around(np.eye(4), T_step, search.near([*by_odometry, np.eye(4), T_continued]))
         if self._is_usual(fits) and (not here or fits[0].mean_log >= here[0].mean_log):
             self._map, self._lost = local, None
             return search, fits
-        self._lost = None if num_scans + 1 >= WINDOW else (local, T_step, num_scans + 1)
+        self._lost = None if since > WINDOW else (local, T_step, since)
         return None
 
     def _is_found(self, search: PoseSearch, fits: Sequence[Fit], T_map_starts: Sequence[Transform]) -> bool:

@@ -931,7 +931,7 @@ def test_a_map_before_a_break_is_used_again_if_it_explains_the_scan_better(is_be
     odometry = _checked(truth.T_world_lidar)
     last = _registered(odometry, scans[:SLIP_AT])[-1].T_odom_lidar
     before, odometry._map = odometry._map, LocalMap(CONFIG.refine)
-    odometry._lost = before, odometry._motion.T_step, 0
+    odometry._lost = before, odometry._motion.T_step, 1.0
     scan = SeenScan(scans[SLIP_AT].points, CONFIG.refine)
     T_odom_lidar = last @ geometry.inverse(truth.T_world_lidar[SLIP_AT - 1]) @ truth.T_world_lidar[SLIP_AT]
     there = before.register(scan, geometry.inverse(before.T_odom_map) @ T_odom_lidar)[0]
@@ -942,22 +942,27 @@ def test_a_map_before_a_break_is_used_again_if_it_explains_the_scan_better(is_be
 
 
 @pytest.mark.long
-def test_a_map_before_a_break_is_found_again_where_the_motion_before_it_leads() -> None:
-    """The sensor moves nine metres a scan; one scan shows another place, and the odometry is far off since then."""
+@pytest.mark.parametrize(("num_steps", "gap"), [(4, 1.0), (2, 3.0)])
+def test_a_map_before_a_break_is_found_again_where_the_motion_before_it_leads(num_steps: int, gap: float) -> None:
+    """One scan shows another place; the next one, 18 m on, is the second of this speed, or comes after three intervals.
+
+    The odometry is far off since then.
+    """
     scans, truth = round_drive()
     odometry = _checked(truth.T_world_lidar)
     last = _registered(odometry, scans[:SLIP_AT])[-1].T_odom_lidar
     before, odometry._map = odometry._map, LocalMap(CONFIG.refine)
-    T_step, T_two_steps = (
-        geometry.inverse(truth.T_world_lidar[SLIP_AT - 1]) @ truth.T_world_lidar[SLIP_AT - 1 + num] for num in (4, 8)
+    T_step, T_last_true = (
+        geometry.inverse(truth.T_world_lidar[SLIP_AT - 1]) @ truth.T_world_lidar[SLIP_AT - 1 + num]
+        for num in (num_steps, 8)
     )
-    odometry._lost = before, T_step, 0
+    odometry._lost = before, T_step, 1.0
     far_off = last @ geometry.transform(geometry.yaw(2.0), [0.0, -40.0, 0.0])
     scan = SeenScan(scans[SLIP_AT + 7].points, CONFIG.refine)
-    found = odometry._rejoined(Proposed(scan, far_off, far_off, 1.0), [])
+    found = odometry._rejoined(Proposed(scan, far_off, far_off, gap), [])
     assert found is not None
     T_last_found = geometry.inverse(last) @ before.T_odom_map @ found[1][0].T_map_lidar
-    assert geometry.distance(geometry.inverse(T_two_steps) @ T_last_found) < 0.1
+    assert geometry.distance(geometry.inverse(T_last_true) @ T_last_found) < 0.1
 
 
 def test_an_odometry_that_reports_no_motion_is_checked_too() -> None:

@@ -2,7 +2,11 @@
 
 import os
 import signal
+import subprocess
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,6 +18,7 @@ from segslam.bench.experiments.pairs import PairList, Trial, cut_pairs, pair_tri
 from segslam.bench.experiments.rows import Row, read_rows
 from segslam.core.config import Config
 from segslam.core.types import SegslamError
+from segslam.run.fleets.workers import workers
 from segslam.scans import DataSource
 
 distributed = pytest.importorskip("distributed")
@@ -71,6 +76,53 @@ def test_a_worker_that_is_killed_changes_nothing_in_the_table(
 def test_a_missing_cluster_is_reported(job: Job, trials: list[Trial]) -> None:
     with pytest.raises(SegslamError, match="no answer"):
         next(run(job, trials, scheduler="tcp://127.0.0.1:9"))
+
+
+@contextmanager
+def scheduler(folder: Path, *, has_worker: bool) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+    """The process of a scheduler, and its address; with a worker if asked for."""
+    file, dask = folder / "scheduler.json", [sys.executable, "-m", "dask"]
+    options = ("--port", "0", "--no-dashboard", "--dashboard-address", ":0", "--scheduler-file", str(file))
+    with ExitStack() as stack:
+        one = stack.enter_context(subprocess.Popen([*dask, "scheduler", *options], stderr=subprocess.DEVNULL))
+        stack.callback(one.kill)
+        while not file.exists():
+            time.sleep(0.1)
+        with distributed.Client(scheduler_file=str(file)) as client:
+            address = client.scheduler.address
+            if has_worker:
+                worker = [*dask, "worker", address, "--no-nanny", "--no-dashboard"]
+                other = stack.enter_context(subprocess.Popen(worker, stderr=subprocess.DEVNULL, cwd=folder))
+                stack.callback(other.kill)
+                client.wait_for_workers(1, timeout=30)
+        yield one, address
+
+
+@pytest.mark.long
+def test_a_lost_scheduler_is_reported_in_one_line(
+    job: Job, trials: list[Trial], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with scheduler(tmp_path, has_worker=True) as (process, address):
+        rows = run(job, trials, scheduler=address)
+        next(rows)
+        with workers(tmp_path, number=1, scheduler=address) as (work, _):
+            sleeping = work(time.sleep, [(60.0,)])
+            process.terminate()
+            for lost in (sleeping, rows):
+                with pytest.raises(SegslamError, match="the scheduler is lost; start it and its workers again"):
+                    list(lost)
+    assert not [record for record in caplog.records if record.name.startswith("distributed")]
+
+
+@pytest.mark.long
+def test_a_benchmark_does_not_wait_for_a_scheduler_without_workers(
+    job: Job, trials: list[Trial], tmp_path: Path
+) -> None:
+    with (
+        scheduler(tmp_path, has_worker=False) as (_, address),
+        pytest.raises(SegslamError, match="it has no workers; start `dask worker tcp:"),
+    ):
+        next(run(job, trials, scheduler=address))
 
 
 def test_without_dask_the_message_has_the_install_command(

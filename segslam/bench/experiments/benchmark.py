@@ -15,7 +15,7 @@ from segslam.bench.experiments.rows import LOST_WORKER, Row, append_rows, groupe
 from segslam.core.errors import reason
 from segslam.core.types import SegslamError
 from segslam.core.whole_files import write_whole
-from segslam.run.fleets.workers import cluster
+from segslam.run.fleets.workers import cluster, result_of
 
 ROWS_FILE = "details.csv"
 IDENTITY_FILE = "asked.json"
@@ -63,7 +63,7 @@ def _work(job: Job, trials: Sequence[Trial], workers: int, scheduler: str | None
         for trial in trials:
             yield register_trial(job, trial, prepared(trial.source), prepared(trial.target))
     elif trials:
-        with cluster(workers=workers, scheduler=scheduler) as client:
+        with cluster(job.source.data, workers=workers, scheduler=scheduler) as client:
             yield from _run_on(client, job, trials)
 
 
@@ -95,7 +95,7 @@ def _run_on(client: Any, job: Job, trials: Sequence[Trial]) -> Iterator[list[Row
     for future in running:
         trial = pending.pop(future.key)
         try:
-            rows = future.result()
+            rows = result_of(future)
         except KilledWorker:
             rows = [failed_row(method, trial, LOST_WORKER) for method in job.methods]
         for variant in (trial.source, trial.target):

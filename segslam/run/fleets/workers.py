@@ -65,39 +65,44 @@ def workers(folder: Path, *, number: int, scheduler: str | None) -> Iterator[tup
         return
     import dask
 
-    with dask.config.set({"distributed.worker.daemon": False}), cluster(workers=number, scheduler=scheduler) as client:
-        _check(client, folder, scheduler)
+    with (
+        dask.config.set({"distributed.worker.daemon": False}),
+        cluster(folder, workers=number, scheduler=scheduler) as client,
+    ):
         yield partial(_on_cluster, client), client.dashboard_link if scheduler else ""
 
 
 @contextmanager
-def cluster(*, workers: int, scheduler: str | None) -> Iterator[Any]:
+def cluster(shared: Path, *, workers: int, scheduler: str | None) -> Iterator[Any]:
     """A Dask client for the scheduler at an address, or for local worker processes.
 
-    Raises SegslamError if Dask is not installed or the scheduler does not answer.
+    Raises SegslamError if Dask is not installed, and as `workers`.
     """
     try:
         from distributed import Client, LocalCluster  # optional package: extra `cluster`
     except ImportError as error:
         raise SegslamError(f"--workers and --scheduler need Dask: {how_to_install('cluster')}") from error
     logging.getLogger("distributed").setLevel(logging.WARNING)  # its info level reports each connection
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # `result_of` reports a lost scheduler
     if scheduler is not None:
         try:
             client = Client(scheduler, timeout=5)
         except (OSError, ValueError) as error:
             raise SegslamError(f"--scheduler {scheduler}: no answer ({error}); start `dask scheduler`") from error
         with client:
+            _check(client, shared, scheduler)
             yield client
         return
     with (
         LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as local,
         Client(local) as client,
     ):
+        _check(client, shared, scheduler)
         yield client
 
 
-def _check(client: Any, folder: Path, scheduler: str | None) -> None:
-    """Raises SegslamError unless all workers have this version and see the folder."""
+def _check(client: Any, shared: Path, scheduler: str | None) -> None:
+    """Raises SegslamError unless there are workers, and all have this version and see the folder or file."""
     versions = client.run(version, "segslam", on_error="return")
     if not versions:
         raise SegslamError(f"--scheduler {scheduler}: it has no workers; start `dask worker {scheduler}`")
@@ -105,9 +110,9 @@ def _check(client: Any, folder: Path, scheduler: str | None) -> None:
         if found != version("segslam"):
             has = f"has segslam {found}" if isinstance(found, str) else "cannot import segslam"
             raise SegslamError(f"worker {worker}: {has}, this is {version('segslam')}; install the same version there")
-    for worker, sees in client.run(Path.is_dir, folder).items():
+    for worker, sees in client.run(Path.exists, shared).items():
         if not sees:
-            raise SegslamError(f"worker {worker}: does not see {folder}; give a folder that all workers share")
+            raise SegslamError(f"worker {worker}: does not see {shared}; give a folder that all workers share")
 
 
 def _on_cluster(
@@ -120,9 +125,19 @@ def _on_cluster(
     futures = [submit(attempted, function, *task, key=f"{name}-{uuid4().hex}") for task in tasks]
     numbers = {future.key: number for number, future in enumerate(futures)}
     for future in as_completed(futures):
-        if future.status in ("cancelled", "lost"):
-            raise SegslamError("the scheduler is lost; start it again, and call `segslam fleet` again to go on")
         try:
-            yield numbers[future.key], future.result()
+            yield numbers[future.key], result_of(future)
         except KilledWorker:
             yield numbers[future.key], Outcome(None, "every worker process that tried it died")
+
+
+def result_of(future: Any) -> Any:
+    """The result of a task. Raises SegslamError if the scheduler is lost, or what the task raised."""
+    from distributed import CancelledError
+
+    try:
+        return future.result()
+    except CancelledError as error:
+        raise SegslamError(
+            "the scheduler is lost; start it and its workers again, and give the same command again to go on"
+        ) from error

@@ -114,7 +114,9 @@ def fleet(
         print((result.folder / FILE).read_text(encoding="utf-8").rstrip(), flush=True)
         return
     for number, component in enumerate(result.components):
-        error = f", error {component['ate_m']:.3f} m" if "ate_m" in component else ""
-        loops = f"{counted(component.get('num_loops_between', 0), 'loop')} between them"
-        terminal.say(f"component {number}: {', '.join(component['drives'])}; {loops}{error}")
+        facts = [", ".join(component["drives"])]
+        if len(component["drives"]) > 1:
+            facts.append(f"{counted(component.get('num_loops_between', 0), 'loop')} between them")
+        facts += [f"error {component['ate_m']:.3f} m"] if "ate_m" in component else []
+        terminal.say(f"component {number}: {'; '.join(facts)}")
     terminal.say(f"report: {result.folder / 'report.html'}")

@@ -259,6 +259,17 @@ def test_nothing_mapped_is_an_error_with_the_first_reason(
     assert "--workers: " in capsys.readouterr().err
 
 
+def test_a_component_of_one_drive_is_shown_without_loops(
+    recordings: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    alone, two = {"drives": ["a"], "ate_m": 0.0041}, {"drives": ["b", "c"], "num_loops_between": 3}
+    result = FleetResult(tmp_path, {}, (alone, two), {})
+    monkeypatch.setattr(segslam.run.fleets.orchestrate, "fleet", lambda *_, **__: result)
+    assert run("fleet", recordings[0], "--out", tmp_path / "city") == 0
+    shown = capsys.readouterr().err
+    assert "component 0: a; error 0.004 m\ncomponent 1: b, c; 3 loops between them\n" in shown
+
+
 def test_a_file_that_is_no_drive_is_named_once_and_leaves_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

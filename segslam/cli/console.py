@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from time import monotonic
 from typing import Annotated, Any, TypeVar
 
@@ -132,11 +133,16 @@ def say(text: str) -> None:
 
 
 @contextmanager
-def how_to_go_on(line: str) -> Iterator[None]:
-    """Context manager that adds to the message of WorkFailed, for example of a full disk, how to continue."""
+def how_to_go_on(line: str, folder: Path) -> Iterator[None]:
+    """Context manager that adds to the message of WorkFailed, for example of a full disk, how to continue.
+
+    Nothing is added if there is nothing to continue: the folder of a run without a step is removed.
+    """
     try:
         yield
     except WorkFailed as error:
+        if not folder.exists():
+            raise
         raise WorkFailed(f"{error}; {line}") from error
 
 

@@ -105,7 +105,7 @@ def live(
         mirror = server.send if server else None
         run = stack.enter_context(Run(out, slam, dataset=source.name, options=recorded, mirror=mirror))
         when_stopped(f"the log in {out} is kept; {go_on}")
-        stack.enter_context(how_to_go_on(go_on))
+        stack.enter_context(how_to_go_on(go_on, out))
         publisher = _publisher(run, stack) if folder is None else None
         figures = _follow(front, run, terminal, scene=scene, server=server, publisher=publisher)
         ended = front.ended

@@ -272,7 +272,7 @@ def _map_scans(
         for file in map_files:
             file.parent.mkdir(parents=True, exist_ok=True)
         when_stopped(f"the log in {folder} is kept; {go_on}")
-        stack.enter_context(how_to_go_on(f"{go_on} when there is space"))
+        stack.enter_context(how_to_go_on(f"{go_on} when there is space", folder))
 
         def watched(steps: "Iterator[Step | BadScan]", total: int, title: str) -> bool:
             """Shows each step and progress; True if Ctrl-C ended it early."""

@@ -82,7 +82,7 @@ def simulate(
     last = 0
     begin_again = f"to start again: {same_command_with('--overwrite')}"
     try:
-        with how_to_go_on(begin_again), interrupts_wait() as interrupts:
+        with how_to_go_on(begin_again, out), interrupts_wait() as interrupts:
             for done in terminal.progress(written, total, "simulate"):
                 last = done
                 if interrupts:
@@ -122,7 +122,7 @@ def demo(
     prepare_folder(data, SEQUENCE, overwrite=False)
     config = SimulationConfig(sensor=sensor)
     written = write_drive(data, SEQUENCE, drive, config=config, seed=SEED)
-    with how_to_go_on(begin_again):
+    with how_to_go_on(begin_again, out):
         for _ in terminal.progress(written, len(drive.time_s), "simulate"):
             pass
     options = RunOptions(labels="geometric", preset="driving")

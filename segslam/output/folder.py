@@ -66,7 +66,10 @@ def check_new(folder: Path) -> None:
     """Raises SegslamError if the new folder of a run is not empty."""
     try:
         if folder.exists() and any(folder.iterdir()):
-            raise SegslamError(f"{folder}: not empty; give another folder with --out, or replace a run: --overwrite")
+            raise SegslamError(
+                f"{folder}: not empty; give another folder with --out, continue an interrupted run: segslam resume, or "
+                "replace a run: --overwrite"
+            )
     except OSError as error:
         raise not_writable(folder, error) from error
 

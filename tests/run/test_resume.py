@@ -186,6 +186,18 @@ def test_a_full_disk_ends_with_status_2_and_the_run_is_resumed_when_there_is_spa
     _resumed_as_whole(kitti, whole, out)
 
 
+def test_a_disk_without_room_for_a_scan_leaves_nothing_to_continue(
+    kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    with largest_file(2000):
+        assert run("map", kitti, "--out", out, *OPTIONS, *SETTINGS) == 2
+    shown = capsys.readouterr().err
+    assert "free space on the disk" in shown
+    assert "segslam resume" not in shown
+    assert not out.exists()
+
+
 @pytest.mark.slow
 def test_results_without_disk_space_end_with_status_2_and_the_run_is_resumed(
     kitti: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -21,6 +21,7 @@ from segslam.cli.viewers import check_display, scene_in, serve_foxglove
 from segslam.core.errors import SegslamError, WorkFailed, counted
 from segslam.core.extras import how_to_install
 from segslam.core.interrupts import stopped_by_signals, when_stopped
+from segslam.core.whole_files import expanded
 
 if TYPE_CHECKING:
     from segslam.output.foxglove_server import FoxgloveServer
@@ -188,6 +189,11 @@ def _check_source(folder: Path | None, topic: str | None, fixes: str | None, out
         check_exists(folder, "give the folder into which scans are written")
         if not folder.is_dir():
             raise SegslamError(f"{folder}: not a folder; for a recording: segslam map {folder} --out {out}")
+    if fixes is not None and expanded(fixes).is_file():
+        raise SegslamError(
+            f"--gnss {fixes}: a file, and live takes a ROS 2 topic, as in --gnss /fix; after the run: "
+            f"segslam georeference {shlex.quote(str(out))} --gnss {shlex.quote(fixes)}"
+        )
     for option, value in (("--topic", topic), ("--gnss", fixes)):
         if value is not None and find_spec("rclpy") is None:
             raise SegslamError(

@@ -350,6 +350,14 @@ def test_without_ros_one_line_has_the_install_command(
 
 
 @pytest.mark.slow
+def test_a_file_with_fixes_is_for_after_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "my fixes.csv").touch()
+    out = tmp_path / "run"
+    assert run("live", tmp_path, "--gnss", tmp_path / "my fixes.csv", "--out", out) == 2
+    assert f"after the run: segslam georeference {out} --gnss '{tmp_path}/my fixes.csv'" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_loops_that_are_not_tried_in_time_are_searched_at_the_end() -> None:
     scans, truth = round_drive()
     slam = drifting_slam()

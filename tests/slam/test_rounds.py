@@ -2,6 +2,7 @@
 
 import os
 import threading
+from collections.abc import Iterable, Iterator
 from functools import cache
 
 import numpy as np
@@ -15,6 +16,7 @@ from segslam.core.types import Alignment, LoopClosure, Registration
 from segslam.graph import Edge, PoseGraph
 from segslam.graph.levenberg_marquardt import Unsolvable
 from segslam.slam.adjustment import Adjusted, Velocities, adjust, rounds
+from segslam.slam.adjustment.vertical_angle import VerticalAngle
 
 STEP_M = 2.0
 NUM = 40
@@ -127,6 +129,22 @@ def test_no_time_leaves_the_graph_unchanged() -> None:
 def test_keyframes_without_points_are_not_adjusted() -> None:
     made = graph()
     assert adjust(made, made.finish(), lambda _: np.empty((0, 3), np.float32), STILL, config=CONFIG) is None
+
+
+@pytest.mark.parametrize(("angle", "title"), [(None, "refine 1/1"), (VerticalAngle(0.2, 0.01, 40), "refine 1/2")])
+def test_a_second_round_is_announced_only_if_an_angle_is_corrected(
+    angle: VerticalAngle | None, title: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    titles: list[str] = []
+
+    def shown(items: Iterable[object], total: int, title: str) -> Iterator[object]:
+        titles.append(title)
+        yield from items
+
+    monkeypatch.setattr(rounds, "measure_vertical_angle", lambda *_, **__: angle)
+    made = graph()
+    adjust(made, made.finish(), lambda _: np.empty((0, 3), np.float32), STILL, config=CONFIG, progress=shown)
+    assert titles == [title]
 
 
 def test_a_graph_that_cannot_be_solved_with_the_submaps_stays_as_it_is(

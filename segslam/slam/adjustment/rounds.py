@@ -205,13 +205,12 @@ def _rounds(
     measured = partial(measure_vertical_angle, straight_of, travel_m=travel_m, motion_variance=motion_variance)
     angle = known.angle if known else measured(T_world, config=refine)
     last: _Round | None = None
-    for number in range(1, config.adjustment.rounds + 1):
+    num_rounds = config.adjustment.rounds if angle is not None and angle.is_significant else 1
+    for number in range(1, num_rounds + 1):
         T_world = graph.T_world_keyframes
-        if number > 1:  # the motions of the odometry turn with the angle: submaps built by them show too much of it
-            again = None
-            if angle is not None and angle.is_significant:
-                near_deg = angle.angle_deg
-                again = measured(T_world, config=refine, near_deg=near_deg)
+        if angle is not None and number > 1:
+            # the motions of the odometry turn with the angle: submaps built by them show too much of it
+            again = measured(T_world, config=refine, near_deg=angle.angle_deg)
             if again is None or not again.is_significant:
                 break
             angle = again
@@ -221,7 +220,7 @@ def _rounds(
         surface_of = surfaces_of(corrected_by(corrections, points_of), T_world, motion_variance, config=refine)
         aligned = of_drives or aligned_by(surface_of)
         pairs = all_pairs(T_world, travel_m, graph.covariances, min_travel_m=config.proximity.min_travel_m)
-        title = f"refine {number}/{config.adjustment.rounds}"
+        title = f"refine {number}/{num_rounds}"
         in_time = partial(_registered_until, end_s, aligned=aligned, T_world=T_world, config=refine)
         if known:  # which keeps alignments in the memory of this process
             tried = list(progress(in_time(pairs.tolist()), len(pairs), title))

@@ -125,6 +125,33 @@ def test_a_benchmark_does_not_wait_for_a_scheduler_without_workers(
         next(run(job, trials, scheduler=address))
 
 
+STOPPED = """
+import sys, time
+from pathlib import Path
+from segslam.run.fleets.workers import workers
+try:
+    with workers(Path(sys.argv[1]), number=2, scheduler=None) as (work, _):
+        sleeping = work(time.sleep, [(60.0,), (60.0,)])
+        print("ready", flush=True)
+        next(sleeping)
+except KeyboardInterrupt:
+    print("stopped")
+"""
+
+
+@pytest.mark.long
+def test_ctrl_c_ends_worker_processes_of_this_machine_and_they_print_nothing(tmp_path: Path) -> None:
+    """A terminal sends it to them too."""
+    command = (sys.executable, "-c", STOPPED, str(tmp_path))
+    out = subprocess.PIPE
+    with subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, text=True, start_new_session=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        time.sleep(1.0)
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.stdout.read() == "stopped\n"
+
+
 def test_without_dask_the_message_has_the_install_command(
     job: Job, trials: list[Trial], monkeypatch: pytest.MonkeyPatch
 ) -> None:

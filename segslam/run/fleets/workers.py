@@ -2,6 +2,7 @@
 
 import gc
 import logging
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -82,7 +83,9 @@ def cluster(shared: Path, *, workers: int, scheduler: str | None) -> Iterator[An
         from distributed import Client, LocalCluster  # optional package: extra `cluster`
     except ImportError as error:
         raise SegslamError(f"--workers and --scheduler need Dask: {how_to_install('cluster')}") from error
-    logging.getLogger("distributed").setLevel(logging.WARNING)  # its info level reports each connection
+    logs = [logging.getLogger(name) for name in ("distributed", "distributed.nanny")]
+    for one in logs:
+        one.setLevel(logging.WARNING)  # their info level reports each connection
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # `result_of` reports a lost scheduler
     if scheduler is not None:
         try:
@@ -93,12 +96,19 @@ def cluster(shared: Path, *, workers: int, scheduler: str | None) -> Iterator[An
             _check(client, shared, scheduler)
             yield client
         return
-    with (
-        LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as local,
-        Client(local) as client,
-    ):
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is for this process, which ends all
+    try:
+        options = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.ERROR}
+        local = LocalCluster(n_workers=workers, **options)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    with local, Client(local) as client:
         _check(client, shared, scheduler)
-        yield client
+        try:
+            yield client
+        finally:
+            for one in logs:
+                one.setLevel(logging.CRITICAL)  # after Ctrl-C they report each worker that is ended amid a task
 
 
 def _check(client: Any, shared: Path, scheduler: str | None) -> None:

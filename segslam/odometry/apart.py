@@ -40,10 +40,7 @@ class OdometryApart(KissOdometry):
         super().__init__(config, self._apart, keeps_alone=self._keeps_alone)
 
     def foresee(self, scan: Scan, *, gap: float) -> None:
-        """Begin to align the next scan, `gap` intervals after this one, as if the pose of this one stays.
-
-        It is aligned while this one is checked; `follow` discards the result.
-        """
+        """Begin to align the next scan, as if the pose of this one stays; `follow` discards the result."""
         with suppress(BadScan):  # `register` raises it
             swept = deskew_scan(scan, self._T_last_lidar, self._config)
             self._apart.begin_to_align(swept[0], geometry.scaled(self._T_last_lidar, gap))

@@ -27,12 +27,11 @@ from segslam.core.probabilities import SIGNIFICANT
 from segslam.core.types import Information, Motion, MotionState, Scan, Transform
 from segslam.graph.edges import BREAK_M
 from segslam.graph.noise import odometry_information
-from segslam.odometry.apart import OdometryApart
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel
 from segslam.odometry.search import PoseSearch, Recover
-from segslam.odometry.sweep import Odometry, OdometryResult
+from segslam.odometry.sweep import Foreseeing, Odometry, OdometryResult
 from segslam.registration.refinement import MIN_POINTS, SHARED_NOISE_DEG, SHARED_NOISE_M
 
 ELSEWHERE_M = 30.0
@@ -92,7 +91,7 @@ class CheckedOdometry:
         gap = max(gap, self._intervals.gap(scan.stamp_ns))
         proposed = self._inner.register(scan, gap=gap)
         self._intervals.note(scan.stamp_ns)
-        if ahead is not None and ahead.stamp_ns > scan.stamp_ns and isinstance(self._inner, OdometryApart):
+        if ahead is not None and ahead.stamp_ns > scan.stamp_ns and isinstance(self._inner, Foreseeing):
             self._inner.foresee(ahead, gap=self._intervals.gap(ahead.stamp_ns))
         if not self._config.health.check:
             return proposed

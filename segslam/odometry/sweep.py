@@ -59,6 +59,15 @@ class Odometry(Protocol):
         ...
 
 
+@runtime_checkable
+class Foreseeing(Protocol):
+    """An odometry that works on the next scan while the present one is checked."""
+
+    def foresee(self, scan: Scan, *, gap: float) -> None:
+        """Begin to register the next scan, `gap` intervals after this one, as if the pose of this one stays."""
+        ...
+
+
 Swept = tuple[Points, ScanLabels, Vector | None]
 """Points (n, 3) float64, their labels and intensities, as `deskew_scan` returns them."""
 

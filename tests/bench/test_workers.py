@@ -140,6 +140,7 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("ctrl_c_works")
 def test_ctrl_c_ends_worker_processes_of_this_machine_and_they_print_nothing(tmp_path: Path) -> None:
     """A terminal sends it to them too."""
     command = (sys.executable, "-c", STOPPED, str(tmp_path))

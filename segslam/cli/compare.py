@@ -20,7 +20,9 @@ SOURCE = "replayed.txt"
 
 
 def compare(
-    runs: Annotated[list[Path], typer.Argument(help="Run folders, two or more.", metavar="RUN RUN...")],
+    runs: Annotated[
+        list[Path], typer.Argument(help="Run folders, or their log.mcap, two or more.", metavar="RUN RUN...")
+    ],
     *,
     plot: Annotated[Path | None, "Draw the trajectories and their errors to this file: .png, .svg or .pdf."] = None,
     tables: TableFiles,
@@ -33,13 +35,15 @@ def compare(
     """
     for folder in runs:
         check_exists(folder, "give run folders")
-    names = _names(runs)
     check_free([plot, tables.csv, tables.latex], overwrite=overwrite)
     terminal.announce(f"compare: reading {counted(len(runs), 'run')}")
     from segslam.output.finished import read_metrics, read_run
+    from segslam.output.folder import folder_of
     from segslam.output.report.comparison import check_picture, draw_runs
     from segslam.output.words import FIGURES
 
+    runs = [folder_of(run) for run in runs]
+    names = _names(runs)
     if plot is not None:
         check_picture(plot)
         draw_runs(plot, {name: read_run(folder) for name, folder in zip(names, runs, strict=True)})

@@ -82,7 +82,7 @@ def localise(
 
 
 def resume(
-    run: Annotated[Path, "Folder of the interrupted run."],
+    run: Annotated[Path, "Folder of the interrupted run, or its log.mcap."],
     *,
     view: ViewOption = False,
     terminal: Terminal,
@@ -93,6 +93,9 @@ def resume(
     """
     check_exists(run, "give a run folder")
     terminal.announce(f"resume: reading {run}")
+    from segslam.output.folder import folder_of
+
+    run = folder_of(run)
     recorded = log_to_resume(run)
     chosen: dict[str, Any] = {name: value for name, value in recorded.options.items() if value}
     again = f"segslam map DATA --out {shlex.quote(str(run))} --resume"

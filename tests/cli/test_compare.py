@@ -33,6 +33,8 @@ def test_runs_stand_side_by_side(runs: list[Path], capsys: pytest.CaptureFixture
     assert lines[0].split() == ["one", "two"]
     assert next(line.split()[:2] for line in lines if "loops accepted" in line) == ["4", "7"]
     assert next(line.split()[:2] for line in lines if "trajectory error" in line) == ["0.25", "-"]
+    assert run("compare", runs[0] / "log.mcap", runs[1]) == 0
+    assert capsys.readouterr().out.splitlines() == lines
 
 
 @pytest.mark.parametrize(("command", "indent"), [("compare", 30), ("eval", 12), ("info", 12)])

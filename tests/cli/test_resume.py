@@ -46,6 +46,11 @@ def cut(whole: Path, tmp_path: Path) -> Path:
     return out
 
 
+def test_the_log_of_a_run_stands_for_its_folder(whole: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert run("resume", whole / "log.mcap") == 0
+    assert "already complete" in capfd.readouterr().err
+
+
 def test_a_run_is_resumed_with_all_its_options(
     cut: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

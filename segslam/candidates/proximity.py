@@ -9,17 +9,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtr
 
 from segslam.candidates.places import SAME_PLACE_M
 from segslam.core import geometry
 from segslam.core.config import ProximityConfig
-from segslam.core.probabilities import INLIER_PROBABILITY
+from segslam.core.probabilities import INLIER_PROBABILITY, sigmas_beyond
 from segslam.core.types import REJECTED_WEIGHT, IndexPairs, Indices, LoopCandidate, LoopClosure, Vector
 
 LEAST_PROBABILITY = 1.0 - INLIER_PROBABILITY
 """Two keyframes that are near each other with a smaller probability are no candidate."""
-FARTHEST = float(-ndtri(LEAST_PROBABILITY / 2.0))
+FARTHEST = sigmas_beyond(LEAST_PROBABILITY)
 """An error of more standard deviations has a smaller probability than that."""
 HEIGHT_M = 1.0
 """Chosen: storeys are 3 m apart: largest height difference of two visits of a place (m)."""

@@ -260,7 +260,7 @@ def _experiment(
     report.
     """
     job = _make_job(data, options, changes, terminal)
-    from segslam.bench.experiments.benchmark import in_order, num_finished, run
+    from segslam.bench.experiments.benchmark import in_order, rows_before, run
     from segslam.bench.experiments.job import open_once
     from segslam.bench.experiments.pairs import PAPER_PAIR, pair_trials, scans_named
     from segslam.bench.experiments.paper import with_paper_values
@@ -283,8 +283,10 @@ def _experiment(
     rows: list[Row] = []
     kept = f"are kept in {options.out}; the same command continues" if options.out else "are lost; --out keeps them"
     when_stopped(f"the finished registrations {kept}")
-    num_before = num_finished(options.out, job, trials) if options.out else 0
-    work = run(job, trials, workers=options.workers, scheduler=options.scheduler, folder=options.out)
+    before = rows_before(options.out, job, trials) if options.out else []
+    num_workers, scheduler = options.workers, options.scheduler
+    work = run(job, trials, workers=num_workers, scheduler=scheduler, folder=options.out, before=before)
+    num_before = len({row.trial_key for row in before})
     shown = terminal.progress(work, len(trials), "bench", num_before=num_before)
     if is_interrupted(map(rows.extend, shown)):
         when_stopped(f"{len(rows)} registrations {kept}")

@@ -1,5 +1,7 @@
 """The two probabilities by which evidence is judged, in all stages."""
 
+from scipy.special import ndtri
+
 INLIER_PROBABILITY = 0.99
 """Statistics: what belongs to a distribution is below this quantile of it. A closure is an inlier if its squared error
 is, by the chi-square distribution (6 degrees of freedom); two keyframes are candidates for a loop unless they are near
@@ -13,3 +15,8 @@ score if its odds of being wrong are less; two edges of a file contradict each o
 with less, and so do two position fixes. The adjustment has the same share of chance for a sweep that scans show, for
 surfaces that become thicker, and for a pose out of reach of an alignment; the clock and the lever arm of a receiver are
 corrected if chance explains what fixes show of them with less."""
+
+
+def sigmas_beyond(probability: float) -> float:
+    """Number of standard deviations that a normal variable exceeds, to either side, with this probability."""
+    return float(-ndtri(0.5 * probability))

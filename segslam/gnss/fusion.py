@@ -11,9 +11,8 @@ without fixes: the solution is used there, too, and between fixes that are near 
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import ndtri
 
-from segslam.core.probabilities import SIGNIFICANT
+from segslam.core.probabilities import SIGNIFICANT, sigmas_beyond
 from segslam.core.trajectory import Poses, travelled_m
 from segslam.core.types import Mask, Points, SegslamError, Vector
 from segslam.gnss.alignment import Placement, antennas, moved, refined
@@ -35,7 +34,7 @@ LEAST_FUSED = 24
 """Chosen: with fewer fixes, four a window, the drive keeps its shape."""
 ROUNDS = 4
 """Chosen: iterations of weights and poses; they settle in three."""
-SIGNIFICANT_SIGMAS = float(-ndtri(0.5 * SIGNIFICANT))
+SIGNIFICANT_SIGMAS = sigmas_beyond(SIGNIFICANT)
 """The clock and the lever arm are corrected beyond this many standard deviations."""
 CONSTANT_ROUNDS = 3
 """Chosen: repetitions of placement and constants; the third changes the lever arm by less than its noise."""

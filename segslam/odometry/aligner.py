@@ -44,8 +44,12 @@ class KissAligner:
         """Align a sweep as well with KISS-ICP as it was before the first `follow`; `alone` returns the pose."""
         self._alone.append(_registered(self._first, points, T_last_predicted))
 
+    def keep(self, T_odom_lidar: Transform) -> None:
+        """Add to `alone` the pose of a sweep before the first `follow`, which `align` has found already."""
+        self._alone.append(T_odom_lidar)
+
     def alone(self) -> list[Transform]:
-        """The pose of each sweep passed to `align_alone`, and those that the caller adds."""
+        """The poses given to `keep`, then that of each sweep passed to `align_alone`."""
         return self._alone
 
 

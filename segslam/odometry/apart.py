@@ -51,7 +51,7 @@ class OdometryApart(KissOdometry):
         if self._foreseen is not None:
             T_discarded, self._foreseen = self._apart.begun(), None
             if self._keeps_alone and not self._has_followed:  # KISS-ICP alone has aligned the next scan with this
-                self.alone().append(T_discarded)
+                self._apart.keep(T_discarded)
                 self._is_alone_known = True
         super().follow(scans, T_odom_lidar, T_before_lidar)
 

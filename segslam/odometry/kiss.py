@@ -60,7 +60,7 @@ class KissOdometry:
     def _register_alone(self, scan: Scan, points: Points, T_odom_lidar: Transform, gap: float) -> None:
         """Keep the pose by KISS-ICP alone; `points` and the pose are those of the scan here."""
         if not self._has_followed:
-            self.alone().append(T_odom_lidar)
+            self._aligner.keep(T_odom_lidar)
         elif self._is_alone_known:
             self._is_alone_known = False
         else:

@@ -26,15 +26,22 @@ PAIRS_AHEAD = 8
 
 
 def run(
-    job: Job, trials: Sequence[Trial], *, workers: int = 1, scheduler: str | None = None, folder: Path | None = None
+    job: Job,
+    trials: Sequence[Trial],
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+    folder: Path | None = None,
+    before: Sequence[Row] | None = None,
 ) -> Iterator[list[Row]]:
     """Yields the rows of each trial when it is finished, starting with those already in the folder.
 
     One worker is this process, several are processes of this machine, those of a scheduler a Dask cluster.
     With a folder, the rows of a trial are on the disk before the next trial is yielded. The same benchmark in the same
-    folder continues where it stopped; raises SegslamError if the folder contains another benchmark.
+    folder continues where it stopped; raises SegslamError if the folder contains another benchmark. `before`: its rows,
+    if `rows_before` has read them already.
     """
-    done = _rows_before(folder, job, trials) if folder else []
+    done = rows_before(folder, job, trials) if folder and before is None else (before or [])
     tried = grouped(done, lambda row: row.trial_key)
     left = [trial for trial in trials if trial.key not in tried]
     if folder:
@@ -44,11 +51,6 @@ def run(
         if folder:
             append_rows(folder / ROWS_FILE, rows)
         yield rows
-
-
-def num_finished(folder: Path, job: Job, trials: Sequence[Trial]) -> int:
-    """Number of trials whose rows are in the folder; raises SegslamError if it contains another benchmark."""
-    return len({row.trial_key for row in _rows_before(folder, job, trials)})
 
 
 def in_order(rows: Sequence[Row], job: Job, trials: Sequence[Trial]) -> list[Row]:
@@ -107,8 +109,8 @@ def _run_on(client: Any, job: Job, trials: Sequence[Trial]) -> Iterator[list[Row
         yield rows
 
 
-def _rows_before(folder: Path, job: Job, trials: Sequence[Trial]) -> list[Row]:
-    """The rows of finished trials; raises SegslamError if they belong to another benchmark."""
+def rows_before(folder: Path, job: Job, trials: Sequence[Trial]) -> list[Row]:
+    """The rows of finished trials in a folder; raises SegslamError if they belong to another benchmark."""
     identity = _identity(job, trials)
     file = folder / IDENTITY_FILE
     try:

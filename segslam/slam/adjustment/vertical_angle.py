@@ -14,11 +14,10 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri
 
 from segslam.core import geometry
 from segslam.core.config import Config, RefineConfig, SensorCalibrationConfig
-from segslam.core.probabilities import INLIER_PROBABILITY
+from segslam.core.probabilities import INLIER_PROBABILITY, sigmas_beyond
 from segslam.core.trajectory import Poses
 from segslam.core.types import Points, Scan, Transform, Vector
 from segslam.keyframes import KeyframeSelector, downsample_keyframe
@@ -39,7 +38,7 @@ MOST_TURN_RAD = math.radians(30.0)
 BIAS_DEG = 0.05
 """Standard deviation added to that of the mean, for what distorts surfaces otherwise: grass seems higher from afar.
 Chosen: KITTI 00 shows 0.18 of 0.205 degrees, a campus (NCLT) -0.04 of 0, simulated streets 0.09 of 0.03."""
-SIGNIFICANT_SIGMAS = float(ndtri(0.5 + 0.5 * INLIER_PROBABILITY))
+INLIER_SIGMAS = sigmas_beyond(1.0 - INLIER_PROBABILITY)
 """An angle is significant above so many standard deviations, 0.129 degrees or more."""
 
 
@@ -54,7 +53,7 @@ class VerticalAngle:
     @property
     def is_significant(self) -> bool:
         """True if the angle differs from zero by more than its error."""
-        return abs(self.angle_deg) > SIGNIFICANT_SIGMAS * self.sigma_deg
+        return abs(self.angle_deg) > INLIER_SIGMAS * self.sigma_deg
 
     @property
     def correction_deg(self) -> float:

@@ -14,7 +14,7 @@ from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.verification import pair, register_prepared
 from tools.benchmarks import scenes
 from tools.benchmarks.scene_drives import driven
-from tools.benchmarks.scene_models import SCENES, SENSORS, corridor, scan_points
+from tools.benchmarks.scene_models import SCENES, SENSORS, corridor, pose, scan_points
 
 CONFIG = Config()
 TARGET_X, SOURCE_X = 20.0, 25.0
@@ -109,6 +109,18 @@ def test_where_a_direction_is_badly_observed_little_free_space_may_be_violated()
     lot = scenes.Place(SCENES["parking lot"](5), "90 high", 0.03, 5, CONFIG)
     found = register_prepared(lot.prepared(72, 1), lot.prepared(195, 2), config=CONFIG)
     assert isinstance(found, Rejected), found
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_sensor_has_room_and_something_to_see_along_the_whole_path(name: str) -> None:
+    scene = SCENES[name](5)
+    for row in range(0, len(scene.path), 12):
+        points = scan_points(scene, "16", pose(scene, row, np.random.default_rng(row)), noise_m=0.0, rng=np.random.default_rng(row))
+        ranges = np.linalg.norm(points, axis=1)
+        assert len(points) > 3000, row
+        assert ranges.min() > 0.5, row
+        assert np.ptp(points, axis=0).min() > 1.0, row  # no direction without extent
+    assert not np.array_equal(SCENES[name](6).mesh.vertices, scene.mesh.vertices)
 
 
 def _is_wrong(found: Alignment | Rejected) -> bool:

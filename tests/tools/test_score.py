@@ -3,11 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from segslam.core import geometry
+from segslam.core.config import Config
 from segslam.verification.patches import BINS
-from segslam.verification.score import NO_OTHER
+from segslam.verification.score import NO_OTHER, paired_lead, shipped
+from tools.benchmarks.scenes import tasks
 from tools.benchmarks.score.__main__ import curve, tenths
+from tools.benchmarks.score.pairs import described
 from tools.benchmarks.score.ratio import (
     Pair,
     Pose,
@@ -89,3 +93,18 @@ def test_tenths_compare_probabilities_with_what_is_right() -> None:
     rows = tenths([(best, 4.0), (best, 5.0), (wrong, -4.0), (wrong, 4.5)])
     assert [row["poses"] for row in rows] == [1, 3]
     assert rows[-1]["right"] == np.average([1, 1, 0])
+
+
+@pytest.mark.long
+def test_poses_that_lead_by_much_are_described_with_those_they_lead_over() -> None:
+    """In a tunnel other poses fit nearly as well; those that the registration may drop show how far a pose leads."""
+    config = Config()
+    task = next(iter(tasks("tunnel", "32", 0.03, count=1, seed=9, config=config)))
+    pair = described(task, config)
+    right, others = pair.poses[0], pair.poses[1:]
+    assert right.is_right
+    leads = [
+        paired_lead(shipped().ratios, [(right.of_source, other.of_source), (right.of_target, other.of_target)])
+        for other in others
+    ]
+    assert min(leads) < NO_OTHER

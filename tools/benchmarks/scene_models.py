@@ -1,21 +1,21 @@
-"""Scenes other than streets, for registration tests: corridor, garage, tunnel, forest, parking lot, open square.
+"""Scenes other than streets, for registration tests: corridor, garage, tunnel, forest, parking lot, square, and more.
 
 Sensors of several kinds scan them: 16 to 128 beams, high or narrow fields of view, a non-repetitive pattern.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
-import open3d as o3d
 
-from segslam.bench.simulation.mesh import Mesh, box, join_meshes, leaves, mesh, placed, stem
+from segslam.bench.simulation.mesh import box, placed, stem
 from segslam.bench.simulation.objects import bush, car, tree
-from segslam.bench.simulation.world import cast_mesh, rays_of, scene_of
+from segslam.bench.simulation.world import cast_mesh, rays_of
 from segslam.core import geometry
 from segslam.core.types import Label, Points, Transform
+from tools.benchmarks.scene_models_more import MORE_SCENES
+from tools.benchmarks.scene_parts import Scene, lifted, path_along, scene_of_parts, slab, uneven_ground, wall
 
 SENSORS = {
     "16": (16, (-15.0, 15.0), 360.0), "32": (32, (-25.0, 15.0), 360.0), "64": (64, (-22.5, 22.5), 360.0),
@@ -29,31 +29,14 @@ MIN_RANGE_M, MAX_RANGE_M = 0.5, 100.0
 DROPOUT = 0.02
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Scene:
-    """A static scene. `path` (n, 4): positions (m) and headings (rad) of a sensor driven through it."""
-
-    mesh: Mesh
-    path: np.ndarray
-    max_shift_m: float
-    """Largest distance between two scans that still show the same objects."""
-    rays: o3d.t.geometry.RaycastingScene
-    """That of `mesh`."""
-
-
-def _scene(parts: Sequence[Mesh], path: np.ndarray, max_shift_m: float) -> Scene:
-    whole = join_meshes(parts)
-    return Scene(whole, path, max_shift_m, scene_of(whole))
-
-
 def corridor(seed: int, *, regular: bool = False) -> Scene:
     """A corridor 2.4 m wide and 2.6 m high with recessed doors.
 
     The doors are 3 m apart if `regular`. Otherwise their distances are irregular, and cupboards stand along the walls.
     """
     rng, length_m = np.random.default_rng(seed), 60.0
-    parts = [_slab(0.0, length_m, -1.2, 1.2, 0.0, Label.OTHER_GROUND), _slab(0.0, length_m, -1.2, 1.2, 2.6)]
-    parts += [_wall([(x, -1.6), (x, 1.6)], 2.6) for x in (0.0, length_m)]
+    parts = [slab(0.0, length_m, -1.2, 1.2, 0.0, Label.OTHER_GROUND), slab(0.0, length_m, -1.2, 1.2, 2.6)]
+    parts += [wall([(x, -1.6), (x, 1.6)], 2.6) for x in (0.0, length_m)]
     for side in (-1.0, 1.0):
         if regular:
             doors = [(x, 1.0, 0.3) for x in np.arange(0.5, length_m - 1.5, 3.0)]
@@ -64,7 +47,7 @@ def corridor(seed: int, *, regular: bool = False) -> Scene:
         for x, width, depth in doors:
             line += [(x, side * 1.2), (x, side * (1.2 + depth))]
             line += [(x + width, side * (1.2 + depth)), (x + width, side * 1.2)]
-        parts.append(_wall([*line, (length_m, side * 1.2)], 2.6))
+        parts.append(wall([*line, (length_m, side * 1.2)], 2.6))
         if not regular:
             parts += [
                 box(rng.uniform(0.4, 1.2), rng.uniform(0.3, 0.45), 0.0, rng.uniform(0.8, 2.1), Label.UNLABELLED,
@@ -72,23 +55,23 @@ def corridor(seed: int, *, regular: bool = False) -> Scene:
                 for x in rng.uniform(2.0, length_m - 2.0, size=int(length_m / 9))
             ]  # fmt: skip
     along = np.arange(6.0, length_m - 6.0, 0.5)
-    return _scene(parts, _path(along, 0.1 * np.sin(along), 1.0, 0.0), 6.0)
+    return scene_of_parts(parts, path_along(along, 0.1 * np.sin(along), 1.0, 0.0), 6.0)
 
 
 def garage(seed: int) -> Scene:
     """Three levels 3 m apart with the same pillars and walls, but different cars. The path runs through all levels."""
     rng = np.random.default_rng(seed)
     length, width = 64.0, 34.0
-    parts, paths = [_slab(0.0, length, 0.0, width, 0.0, Label.OTHER_GROUND)], []
+    parts, paths = [slab(0.0, length, 0.0, width, 0.0, Label.OTHER_GROUND)], []
     for level in range(3):
         floor = 3.0 * level
-        parts.append(_slab(0.0, length, 0.0, width, floor + 2.85))
+        parts.append(slab(0.0, length, 0.0, width, floor + 2.85))
         rim = [(0.0, 0.0), (length, 0.0), (length, width), (0.0, width), (0.0, 0.0)]
-        parts.append(_lifted(_wall(rim, 1.1), floor))  # a parapet, open above
+        parts.append(lifted(wall(rim, 1.1), floor))  # a parapet, open above
         stairs = [(28.0, 14.0), (36.0, 14.0), (36.0, 20.0), (28.0, 20.0), (28.0, 14.0)]
-        parts.append(_lifted(_wall(stairs, 2.85), floor))
+        parts.append(lifted(wall(stairs, 2.85), floor))
         pillars = [(x, y) for x in np.arange(8.0, length, 8.0) for y in (5.5, 11.5, 22.5, 28.5)]
-        parts += [_lifted(box(0.5, 0.5, 0.0, 2.85, Label.BUILDING, at=at), floor) for at in pillars]
+        parts += [lifted(box(0.5, 0.5, 0.0, 2.85, Label.BUILDING, at=at), floor) for at in pillars]
         for y in (2.7, 14.2, 19.8, 31.3):
             parts += [
                 placed(car(rng), x, y + rng.normal(0, 0.15), floor, yaw_rad=rng.choice([-1, 1]) * np.pi / 2)
@@ -96,87 +79,87 @@ def garage(seed: int) -> Scene:
                 if rng.random() < 0.45 and not (26.0 < x < 38.0 and 10.0 < y < 24.0)
             ]
         along = np.arange(6.0, length - 6.0, 0.75)
-        paths += [_path(along, np.full_like(along, y), floor + 1.8, yaw) for y, yaw in ((8.4, 0.0), (25.6, np.pi))]
-    return _scene(parts, np.concatenate(paths), 10.0)
+        paths += [path_along(along, np.full_like(along, y), floor + 1.8, yaw) for y, yaw in ((8.4, 0.0), (25.6, np.pi))]
+    return scene_of_parts(parts, np.concatenate(paths), 10.0)
 
 
 def tunnel(seed: int) -> Scene:
     """A tunnel 10 m wide and 6 m high with niches, signs, lamps and cabinets at irregular distances."""
     rng, length_m = np.random.default_rng(seed), 240.0
-    parts = [_slab(0.0, length_m, -5.0, 5.0, 0.0, Label.ROAD), _slab(0.0, length_m, -5.0, 5.0, 6.0)]
+    parts = [slab(0.0, length_m, -5.0, 5.0, 0.0, Label.ROAD), slab(0.0, length_m, -5.0, 5.0, 6.0)]
     for side in (-1.0, 1.0):
         line = [(0.0, side * 5.0)]
         for x in np.cumsum(rng.uniform(12.0, 32.0, size=int(length_m / 22))):
             if x < length_m - 5.0:
                 line += [(x, side * 5.0), (x, side * 6.5), (x + 2.5, side * 6.5), (x + 2.5, side * 5.0)]
-        parts.append(_wall([*line, (length_m, side * 5.0)], 6.0))
+        parts.append(wall([*line, (length_m, side * 5.0)], 6.0))
         parts += [
             box(rng.uniform(0.5, 1.2), 0.5, 0.0, rng.uniform(1.2, 2.2), Label.UNLABELLED, at=(x, side * 4.75))
             for x in rng.uniform(5.0, length_m - 5.0, size=int(length_m / 12))
         ]
     parts += [
-        _lifted(box(rng.uniform(0.3, 0.9), rng.uniform(1.0, 2.5), 0.0, 0.6, Label.UNLABELLED, at=(x, 0.0)), 4.6)
+        lifted(box(rng.uniform(0.3, 0.9), rng.uniform(1.0, 2.5), 0.0, 0.6, Label.UNLABELLED, at=(x, 0.0)), 4.6)
         for x in rng.uniform(5.0, length_m - 5.0, size=int(length_m / 25))
     ]  # fans and signs under the ceiling
     along = np.arange(40.0, length_m - 40.0, 1.0)
-    return _scene(parts, _path(along, -1.8 + 0.2 * np.sin(along / 9.0), 1.8, 0.0), 10.0)
+    return scene_of_parts(parts, path_along(along, -1.8 + 0.2 * np.sin(along / 9.0), 1.8, 0.0), 10.0)
 
 
 def forest(seed: int) -> Scene:
     """Trunks, crowns and bushes on uneven ground."""
     rng = np.random.default_rng(seed)
     size = 110.0
-    parts = [_ground(rng, size, 1.2)]
+    parts = [uneven_ground(rng, size, 1.2)]
     at = rng.uniform(0.0, size, size=(420, 2))
     at = at[np.abs(at[:, 1] - size / 2 - 6.0 * np.sin(at[:, 0] / 15.0)) > 1.6]
     parts += [placed(tree(rng), x, y, 0.0) for x, y in at[:330]]
     parts += [placed(bush(rng, *rng.uniform(0.8, 2.2, 2)), x, y, 0.0) for x, y in at[330:]]
     along = np.arange(20.0, size - 20.0, 1.0)
     heading = np.arctan(0.4 * np.cos(along / 15.0))
-    return _scene(parts, _path(along, size / 2 + 6.0 * np.sin(along / 15.0), 1.8, heading), 8.0)
+    return scene_of_parts(parts, path_along(along, size / 2 + 6.0 * np.sin(along / 15.0), 1.8, heading), 8.0)
 
 
 def parking_lot(seed: int) -> Scene:
     """Rows of identical cars 2.6 m apart, with a third of the places free; lamps, a hedge, a building at one side."""
     rng = np.random.default_rng(seed)
     equal = car(np.random.default_rng(7))
-    parts = [_slab(-60.0, 160.0, -60.0, 110.0, 0.0, Label.PARKING)]
+    parts = [slab(-60.0, 160.0, -60.0, 110.0, 0.0, Label.PARKING)]
     for y in np.arange(0.0, 60.0, 11.0):
         taken = [x for x in np.arange(0.0, 100.0, 2.6) if rng.random() < 0.67]
         parts += [placed(equal, x, y, 0.0, yaw_rad=np.pi / 2) for x in taken]
     parts += [
         placed(stem((0.09, 0.07), (0.0, 6.0), Label.POLE), x, y, 0.0) for x in (10.4, 46.8, 83.2) for y in (5.5, 38.5)
     ]
-    parts.append(_wall([(-10.0, 75.0), (35.0, 75.0), (35.0, 82.0), (70.0, 82.0)], 9.0))
+    parts.append(wall([(-10.0, 75.0), (35.0, 75.0), (35.0, 82.0), (70.0, 82.0)], 9.0))
     parts += [placed(tree(rng), x, -12.0 + rng.normal(0, 0.5), 0.0) for x in rng.uniform(-10.0, 110.0, 12)]
     along = np.arange(12.0, 90.0, 0.75)
-    rows = [_path(along, np.full_like(along, y), 1.8, yaw) for y, yaw in ((5.5 + 0.0, 0.0), (27.5, np.pi))]
-    return _scene(parts, np.concatenate(rows), 10.0)
+    rows = [path_along(along, np.full_like(along, y), 1.8, yaw) for y, yaw in ((5.5 + 0.0, 0.0), (27.5, np.pi))]
+    return scene_of_parts(parts, np.concatenate(rows), 10.0)
 
 
 def square(seed: int) -> Scene:
     """An open paved square: facades at 35 to 55 m, a monument, lamps, a few trees."""
     rng = np.random.default_rng(seed)
-    parts = [_slab(-90.0, 90.0, -90.0, 90.0, 0.0, Label.OTHER_GROUND)]
+    parts = [slab(-90.0, 90.0, -90.0, 90.0, 0.0, Label.OTHER_GROUND)]
     corners = [(-52.0, -40.0), (48.0, -45.0), (55.0, 38.0), (8.0, 46.0), (-45.0, 41.0), (-52.0, -40.0)]
     for (x0, y0), (x1, y1) in pairwise(corners):
         cuts = np.sort(np.concatenate([[0.0, 0.92], rng.uniform(0.05, 0.9, 4)]))
         for a, b in pairwise(cuts):
             back = rng.uniform(-2.5, 2.5) * np.array([-(y1 - y0), x1 - x0]) / np.hypot(x1 - x0, y1 - y0)
             ends = [np.array([x0, y0]) + share * np.array([x1 - x0, y1 - y0]) + back for share in (a, b)]
-            parts.append(_wall([tuple(end) for end in ends], rng.uniform(8.0, 16.0)))
+            parts.append(wall([tuple(end) for end in ends], rng.uniform(8.0, 16.0)))
     parts.append(box(3.0, 3.0, 0.0, 5.0, Label.UNLABELLED, at=(20.0, 12.0)))
     parts += [
         placed(stem((0.09, 0.07), (0.0, 6.0), Label.POLE), x, y, 0.0) for x, y in rng.uniform(-38.0, 38.0, (8, 2))
     ]
     parts += [placed(tree(rng), x, y, 0.0) for x, y in rng.uniform(-36.0, 36.0, (4, 2))]
     along = np.arange(-30.0, 30.0, 0.75)
-    return _scene(parts, _path(along, 0.3 * along, 1.8, np.arctan(0.3)), 12.0)
+    return scene_of_parts(parts, path_along(along, 0.3 * along, 1.8, np.arctan(0.3)), 12.0)
 
 
 SCENES: dict[str, Callable[[int], Scene]] = {
     "corridor": corridor, "garage": garage, "tunnel": tunnel, "forest": forest, "parking lot": parking_lot,
-    "square": square,
+    "square": square, **MORE_SCENES,
 }  # fmt: skip
 
 
@@ -211,43 +194,3 @@ def _rays(sensor: str, rng: np.random.Generator) -> Points:
         elevation = np.radians(rng.uniform(low_deg, high_deg, NUM_DRAWN))
     flat = np.cos(elevation)
     return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
-
-
-def _path(x: np.ndarray, y: np.ndarray, z: float, heading: np.ndarray | float) -> np.ndarray:
-    return np.column_stack([x, y, np.full_like(x, z), np.broadcast_to(heading, x.shape)])
-
-
-def _slab(x0: float, x1: float, y0: float, y1: float, z: float, label: Label = Label.BUILDING) -> Mesh:
-    corners = np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
-    return mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), label)
-
-
-def _wall(line: Sequence[tuple[float, float]], height_m: float) -> Mesh:
-    """A vertical wall along a line, from the ground up."""
-    count = len(line)
-    flat = np.column_stack([np.array(line), np.zeros(count)])
-    here = np.arange(count - 1)
-    sides = np.concatenate(
-        [np.column_stack([here, here + 1, here + 1 + count]), np.column_stack([here, here + 1 + count, here + count])]
-    )
-    return mesh(np.concatenate([flat, flat + np.array([0.0, 0.0, height_m])]), sides, Label.BUILDING)
-
-
-def _lifted(part: Mesh, z: float) -> Mesh:
-    return placed(part, 0.0, 0.0, z)
-
-
-def _ground(rng: np.random.Generator, size: float, step: float) -> Mesh:
-    """Ground with bumps of about 10 cm and tufts of grass."""
-    side = np.arange(-20.0, size + 20.0, step)
-    x, y = np.meshgrid(side, side, indexing="ij")
-    z = 0.12 * np.sin(x / 3.1) * np.cos(y / 4.3) + rng.normal(scale=0.04, size=x.shape)
-    row, column = (index.ravel() for index in np.meshgrid(*(np.arange(len(side) - 1),) * 2, indexing="ij"))
-    at = row * len(side) + column
-    triangles = np.concatenate(
-        [np.column_stack([at, at + len(side), at + 1]), np.column_stack([at + 1, at + len(side), at + len(side) + 1])]
-    )
-    tufts = np.column_stack([rng.uniform(0.0, size, (2500, 2)), rng.uniform(0.05, 0.35, 2500)])
-    return join_meshes(
-        [mesh(np.column_stack([x.ravel(), y.ravel(), z.ravel()]), triangles, Label.TERRAIN), leaves(tufts, 0.3, rng)]
-    )

@@ -13,7 +13,7 @@ from segslam.core.config import Config, KeyframeConfig
 from segslam.core.points import voxel_first
 from segslam.core.types import CloudOf, Indices, Keyframe, Label, Labels, Points, Transform, Vector
 from segslam.registration import refinement
-from segslam.registration.prepared import Labeller, PreparedScan, prepare_scan
+from segslam.registration.prepared import Labeller, Observed, PreparedScan, prepare_observed, prepare_scan
 
 DENSE_VOXELS = 3000
 """Chosen on KITTI, courtyard, NCLT: a keyframe with fewer voxels (refine.voxel_m) is matched together with its
@@ -170,6 +170,11 @@ class Submaps:
         """The submap of a keyframe, prepared for alignment."""
         made = self.submap(keyframe_id)
         return prepare_scan(made.points, made.labels, config=self._config, seen_from_here=made.seen_from_here)
+
+    def observed(self, keyframe_id: int) -> Observed:
+        """What the submap of a keyframe saw: sufficient for a pose that is nearly known."""
+        made = self.submap(keyframe_id)
+        return prepare_observed(made.points, made.labels, config=self._config, seen_from_here=made.seen_from_here)
 
     def _neighbours(self, keyframe_id: int, newest_id: int) -> Iterator[int]:
         """Keyframes around one, nearest first, whose relative pose odometry knows better than the size of a voxel."""

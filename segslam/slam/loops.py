@@ -57,6 +57,7 @@ class LoopCloser:
         self.detector = ProximityDetector(config.proximity)
         self.submaps = Submaps(config, clouds, labeller, lambda: graph.motion_variance)
         self._prepared = lru_cache(NUM_PREPARED)(self.submaps.prepared)
+        self._observed = lru_cache(NUM_PREPARED)(self.submaps.observed)
         self._confirmation = Confirmation(graph)
         self._far = FarLoops(config, graph, self._prepared, self._confirmation, edits.forbidden)
         self._tried: set[tuple[int, int]] = set(edits.forbidden)
@@ -82,6 +83,7 @@ class LoopCloser:
     def forget(self) -> None:
         """Release the prepared keyframes; they are prepared again when they are needed."""
         self._prepared.cache_clear()
+        self._observed.cache_clear()
         forget_scans()
 
     def attempt(self, keyframe_id: int, watch: Stopwatch, *, below: int | None = None) -> tuple[LoopAttempt, ...]:
@@ -132,16 +134,16 @@ class LoopCloser:
 
     def _attempts(self, candidate: LoopCandidate, watch: Stopwatch) -> tuple[LoopAttempt, ...]:
         own = Stopwatch()
-        with own("prepare"):
-            source, target = at_once(
-                lambda: self._prepared(candidate.source_id), lambda: self._prepared(candidate.target_id)
-            )
+        source_id, target_id = candidate.pair
         outcome: Alignment | Rejected | None = None
         is_by_hand = candidate.pair in self._edits.added
         if self._is_known:
-            prior = candidate.T_target_source_prior
-            outcome = register_near(source, target, prior, config=self._config, watch=own)
+            with own("prepare"):
+                seen = at_once(lambda: self._observed(source_id), lambda: self._observed(target_id))
+            outcome = register_near(*seen, candidate.T_target_source_prior, config=self._config, watch=own)
         if not isinstance(outcome, Alignment):
+            with own("prepare"):
+                source, target = at_once(lambda: self._prepared(source_id), lambda: self._prepared(target_id))
             outcome = register_prepared(
                 source,
                 target,

@@ -20,7 +20,8 @@ from segslam.core.types import (
 )
 from segslam.labels import geometric_labels
 from segslam.registration import refinement
-from segslam.registration.prepared import PreparedScan, prepare_scan
+from segslam.registration.prepared import Observed, PreparedScan, prepare_scan
+from segslam.verification.patches import agreement
 from segslam.verification.rivals import rivals_of
 from segslam.verification.trial import MAX_COARSE_FINE_M, Found, Gate, Trial, anywhere, judged
 
@@ -121,13 +122,12 @@ def _outcome(trial: Trial, coarse: Registration, found: Sequence[Found]) -> Foun
 
 
 def register_near(
-    source: PreparedScan, target: PreparedScan, T_target_source: Transform, *, config: Config, watch: Stopwatch
+    source: Observed, target: Observed, T_target_source: Transform, *, config: Config, watch: Stopwatch
 ) -> Alignment | Rejected:
     """The refined and verified pose near a known one; no other poses are tried.
 
     Rejects FAR_FROM_PRIOR if refinement leads to another pose (`refinement.is_near`).
     """
-    trial = Trial(source, target, config, anywhere, watch)
     with watch("refine"):
         fine = refinement.refine(source.surface, target.surface, T_target_source, config=config.refine)
     if isinstance(fine, Rejected):
@@ -136,5 +136,7 @@ def register_near(
         moved = geometry.inverse(T_target_source) @ fine.T_target_source
         detail = f"moved {geometry.distance(moved):.2f} m, {math.degrees(geometry.angle(moved)):.1f} degrees"
         return Rejected(RejectReason.FAR_FROM_PRIOR, detail)
+    with watch("verify"):
+        shown = agreement(source, target, fine.T_target_source)
     coarse = replace(fine, T_target_source=T_target_source, num_inliers=0, num_correspondences=0)
-    return judged(trial.found(coarse, fine), None, config=config)
+    return judged(Found(coarse, fine, shown), None, config=config)

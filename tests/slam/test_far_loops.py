@@ -15,6 +15,7 @@ from segslam.core.threads import Stopwatch
 from segslam.core.types import (
     Alignment,
     LoopAttempt,
+    LoopCandidate,
     LoopClosure,
     Motion,
     MotionState,
@@ -244,3 +245,26 @@ def test_a_loop_that_waits_after_the_search_by_distance_is_not_tried_by_appearan
         closed += [one.candidate.pair for one in attempts if isinstance(one.outcome, LoopClosure)]
     assert len(closed) >= 3
     assert len(closed) == len(set(closed))
+
+
+@pytest.mark.parametrize("is_near", [True, False])
+def test_of_known_drives_scans_are_described_only_for_loops_that_are_not_near_the_known_pose(
+    is_near: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pose = Registration(np.eye(4), 100, 100, 0.01, np.eye(6))
+    rejected = Rejected(RejectReason.FAR_FROM_PRIOR, "far")
+    monkeypatch.setattr(
+        loops, "register_near", lambda *_, **__: Alignment(pose, pose, 1, 0, 0) if is_near else rejected
+    )
+    monkeypatch.setattr(loops, "register_prepared", lambda *_, **__: rejected)
+    config = load_config(None)
+    no_points = np.zeros((0, 3), np.float32), np.zeros(0, np.uint8)
+    closer = LoopCloser(
+        config, PoseGraph(config.graph), lambda _: no_points, lambda _: no_points[1], NO_EDITS, is_known=True
+    )
+    described: list[int] = []
+    monkeypatch.setattr(closer, "_observed", lambda number: number)
+    monkeypatch.setattr(closer, "_prepared", described.append)
+    (attempt,) = closer._attempts(LoopCandidate(9, 2, np.eye(4), 0.0, np.eye(6)), Stopwatch())
+    assert isinstance(attempt.outcome, LoopClosure) == is_near
+    assert sorted(described) == ([] if is_near else [2, 9])

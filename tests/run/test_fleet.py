@@ -1,6 +1,7 @@
 """A fleet of two days in one place, a stranger and a damaged recording: joined, gone on with, and on a cluster."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from segslam.run.fleets import steps, workers
 from segslam.run.fleets.drives import Drive, read_drives
 from segslam.run.fleets.orchestrate import FILE, FleetResult, fleet
 from segslam.run.fleets.steps import map_drive
+from segslam.run.sessions.recorded import Session
 from segslam.scans import open_dataset
 from segslam.slam.adjustment import submaps
 from segslam.slam.slam import Slam
@@ -196,6 +198,18 @@ def test_an_added_drive_needs_its_own_loops_and_alignments_only_and_the_componen
     (num_aligned, num_searched), (num_aligned_at_once, num_searched_at_once) = counts
     assert 0 < num_aligned < 0.8 * num_aligned_at_once
     assert 0 < num_searched < 0.8 * num_searched_at_once
+
+
+def test_the_run_of_a_drive_is_read_once_until_its_log_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(steps, "read_session", lambda log: Session.__new__(Session))
+    drive = steps.Mapped("monday", "key")
+    log = drive.folder(tmp_path) / "log.mcap"
+    log.parent.mkdir(parents=True)
+    log.write_bytes(b"")
+    first = steps._session(tmp_path, drive)
+    assert steps._session(tmp_path, drive) is first
+    os.utime(log, ns=(1, 1))
+    assert steps._session(tmp_path, drive) is not first
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ from segslam.core.types import SegslamError, Trajectory
 from segslam.gnss.fixes import Fixes
 from segslam.gnss.reading import read_fixes
 from segslam.output.finished import read_metrics
-from segslam.output.folder import write_poses
+from segslam.output.folder import log_of, write_poses
 from segslam.output.georeferenced import georeference, summary
 from segslam.output.log import read_log
 from segslam.run.fleets.drives import Drive, key_of
@@ -42,6 +42,8 @@ KEY = "fleet.key"
 UNFINISHED = ".part"
 MOST_LIKELY = 12
 """Chosen: largest number of keyframes that are searched in another drive, those that look most like a place there."""
+NUM_SESSIONS = 4
+"""Chosen: number of sessions in memory, some 10 MB for 5 km each: a drive is related to several others in turn."""
 ONE_THREAD = "odometry.max_num_threads=1"
 Likely = dict[str, list[tuple[int, float]]]
 """By the name of an earlier drive: keyframes of a drive and their largest similarities to a place there, best first."""
@@ -123,7 +125,7 @@ def index_drive(fleet: Path, drive: Mapped) -> Mapped:
     """Write the signatures of all keyframes of a run; returns the drive."""
     file = drive.signatures(fleet)
     if not file.exists():
-        spectra = np.array([one.spectrum for one in _locator(fleet, drive).signatures])
+        spectra = np.array([one.spectrum for one in _locator(_session(fleet, drive)).signatures])
         _replace(file, lambda part: np.save(part, spectra))
     return drive
 
@@ -167,7 +169,7 @@ def relate(fleet: Path, later: Mapped, earlier: Mapped, queries: Sequence[int]) 
     """The pose of a drive in an earlier one, from its keyframes that look like places there."""
     file = fleet / PAIRS / f"{later.name} at {earlier.name}-{key_of(later.key, earlier.key, queries)}.json"
     if not file.exists():
-        session, locator = read_session(later.folder(fleet)), _locator(fleet, earlier)
+        session, locator = _session(fleet, later), _locator(_session(fleet, earlier))
         relation = find_session(session, locator, config=locator.config, likely=queries)
         _replace(file, partial(write_kept, kind=Relation, value=relation))
     return read_kept(file, Relation)
@@ -180,10 +182,9 @@ def join(
     before, key = _made_with(folder), _component_key(drives, poses, same_reference)
     if before != key:
         part, fleet = _beside(folder), folder.parent
-        sessions = [read_session(drive.folder(fleet)) for drive in drives]
+        sessions = [_session(fleet, drive) for drive in drives]
         if len(drives) == 1:
             shutil.copytree(drives[0].folder(fleet), part)
-            together = sessions[0].run.result.trajectory
         else:
             part.mkdir()
             merged = arranged(sessions, poses, same_reference=same_reference)
@@ -196,10 +197,12 @@ def join(
             # the component before is extended if it has two or more drives, the first of these
             is_extended = len(before.splitlines()) > 1 and key.startswith(before)
             log = read_log(folder) if is_extended else None
-            together = write_merged(merged, part, config, kept=kept, before=log).result.trajectory
+            write_merged(merged, part, config, kept=kept, before=log)
             for file, alignments in kept.changed():
                 _replace(file, partial(write_kept, kind=tuple[KeptAlignment, ...], value=alignments))
-        _write_drives(part / "drives", drives, sessions, together)
+        made = read_log(part).result()
+        assert made is not None
+        _write_drives(part / "drives", drives, sessions, made[1])
         _made(part, folder, key)
     return read_metrics(folder)
 
@@ -225,9 +228,18 @@ def _write_drives(folder: Path, drives: Sequence[Mapped], sessions: Sequence[Ses
         first = rows.stop
 
 
-@lru_cache(2)
-def _locator(fleet: Path, drive: Mapped) -> Locator:
-    return Locator.from_run(drive.folder(fleet))
+def _session(fleet: Path, drive: Mapped) -> Session:
+    """The session of a drive, read once while step after step uses it; read again if its log was changed."""
+    log = log_of(drive.folder(fleet))
+    return _read(log, log.stat().st_mtime_ns if log.exists() else 0)
+
+
+@lru_cache(NUM_SESSIONS)
+def _read(log: Path, changed_ns: int) -> Session:
+    return read_session(log)
+
+
+_locator = lru_cache(2)(Locator)
 
 
 def _beside(target: Path) -> Path:

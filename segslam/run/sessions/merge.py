@@ -181,7 +181,9 @@ def merge(
     sessions = read_sessions(all_expanded(runs))
     config = config or sessions[0].run.config
     merged = plan(sessions, config=config, same_reference=same_reference)
-    return write_merged(merged, new_folder(expanded(out)), config, on_step=on_step)
+    folder = new_folder(expanded(out))
+    write_merged(merged, folder, config, on_step=on_step)
+    return read_run(folder)
 
 
 def write_merged(
@@ -192,13 +194,12 @@ def write_merged(
     kept: Kept = nothing_kept,
     before: RunLog | None = None,
     on_step: Callable[[Step], object] = lambda step: None,
-) -> FinishedRun:
-    """The merged run, in an empty folder. `kept` knows alignments of submaps from earlier, `before` loops."""
+) -> None:
+    """Write the merged run into an empty folder. `kept` knows alignments of submaps from earlier, `before` loops."""
     with merged.begun(folder, config, kept=kept) as run:
         for step in run.take(merged.steps(before)):
             on_step(step)
         run.complete(place=merged.georeference)
-    return read_run(folder)
 
 
 def _placed(sessions: Sequence[Session], session_poses: Sequence[SessionPose | None]) -> Iterator[Session]:

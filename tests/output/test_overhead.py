@@ -14,8 +14,8 @@ from segslam.core import geometry, processes
 from segslam.core.config import MapConfig
 from segslam.core.types import GraphEstimate, Keyframe, Label, Transform
 from segslam.labels.encodings import COLORS
-from segslam.output.map.before_after import BeforeAfter
-from segslam.output.map.from_above import LEAST_PX, cut_heights, free_heights, visible
+from segslam.output.map.before_after import BeforeAfter, _whole_steps
+from segslam.output.map.from_above import BESIDE_M, LEAST_PX, LOWEST_M, cut_heights, free_heights, visible
 from segslam.output.map.picture import MARGIN_M
 from segslam.output.map.write import write_map
 
@@ -64,6 +64,30 @@ def test_a_building_on_the_way_is_cut_and_the_street_is_not() -> None:
     cut_m = _cut([_slab(2.0, 20.0, 65.0)])
     assert np.isinf(cut_m[:8]).all()
     np.testing.assert_allclose(cut_m[12:], 1.0)
+
+
+def test_heights_over_the_path_are_those_of_a_search_among_all_points() -> None:
+    """Also of points that are so far away that their cells are numbered as those of the path."""
+    rng = np.random.default_rng(0)
+    path_m = rng.uniform(-300.0, 300.0, (300, 3)) * np.array([1.0, 1.0, 0.0])
+    beside_path = path_m[:100] + rng.normal(0.0, 0.4, (100, 3)) * np.array([1.0, 1.0, 5.0])
+    parts = [beside_path, path_m[100:] + np.array([0.0, 0.0, 2.0]), rng.uniform(-600.0, 600.0, (9999, 3))]
+    cloud = np.vstack([*parts, np.vstack(parts) + np.array([256.0, -512.0, -1.0])])
+    away_m = np.linalg.norm(cloud[:, None, :2] - path_m[:, :2], axis=2)
+    nearest = away_m.argmin(axis=1)
+    over = (away_m.min(axis=1) < BESIDE_M) & (cloud[:, 2] > LOWEST_M)
+    expected = np.full(len(path_m), np.inf)
+    np.minimum.at(expected, nearest[over], cloud[over, 2])
+    assert 200 < np.isfinite(expected).sum() < 300
+    np.testing.assert_array_equal(free_heights(path_m, [cloud]), expected)
+
+
+@pytest.mark.parametrize("step", [0.1, 0.25, 1 / 3])
+def test_pixels_at_the_border_of_two_are_those_of_a_floor_division(step: float) -> None:
+    borders = np.concatenate([np.arange(-5000, 5000) * step, np.arange(-5000, 5000) / 40])
+    values = np.concatenate([borders, np.nextafter(borders, -np.inf), np.nextafter(borders, np.inf)])
+    np.testing.assert_array_equal(_whole_steps(values, step), (values // step).astype(int))
+    assert step == 0.25 or (np.floor(values / step) != values // step).any()
 
 
 @pytest.mark.long

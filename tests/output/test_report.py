@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from segslam import cli
-from segslam.core import geometry
+from segslam.core import geometry, processes
 from segslam.core.config import Config, load_config
 from segslam.core.types import MotionState, RejectReason, SegslamError
 from segslam.output.accuracy import accuracy
@@ -346,3 +346,16 @@ def test_a_phone_scrolls_wide_pictures_instead_of_shrinking_their_text(scored: P
     html = scored.read_text()
     assert re.search(r"@media \(max-width: 40rem\) \{[^@]*img\[src\*=\"image/png\"\] \{ width: 44rem; \}", html)
     assert "<p>Left: before, by odometry. Right: after, as mapped.</p><img" in html
+
+
+@pytest.mark.parametrize("num_processes", [1, 2])
+def test_the_program_of_the_top_view_is_packed_once_for_all_reports(
+    num_processes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not in the copy of this process that draws the pictures, where it would be lost."""
+    monkeypatch.setattr(processes, "_num_processes", lambda: num_processes)
+    loops.packed_plotly.cache_clear()
+    make_run(tmp_path / "run")
+    for _ in range(2):
+        write_report(tmp_path / "run")
+    assert loops.packed_plotly.cache_info().misses == 1

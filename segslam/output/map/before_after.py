@@ -134,7 +134,10 @@ class _Density:
 
     def pixels(self, points: Points) -> Indices:
         """(k,) indices in the flat counts: the pixels of those points (n, 3) of the world that are in the window."""
-        column, row = ((points[:, :2] - [self._window[0], self._window[2]]) // self._pixel_m).astype(np.int64).T
+        west, _, south, _ = self._window
+        column, row = (
+            _whole_steps(values - first, self._pixel_m) for values, first in zip(points.T, (west, south), strict=False)
+        )
         rows, columns = self.counts.shape
         seen = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
         return row[seen] * columns + column[seen]
@@ -154,6 +157,15 @@ class _Density:
         draw_path(axes, path_m, color=color, width=1.4)
         axes.set(xlim=(west, east), ylim=(south, north), xticks=[], yticks=[], facecolor=BACKGROUND)
         scale_bar(axes, east - west, color="white")
+
+
+def _whole_steps(values: Vector, step: float) -> Indices:
+    """`values // step` in half the time: a quotient is wrong only where it was rounded up to a whole number."""
+    quotients = values / step
+    steps = np.floor(quotients)
+    rounded = steps == quotients
+    steps[rounded] = values[rounded] // step
+    return steps.astype(np.int64)
 
 
 def most_changed(

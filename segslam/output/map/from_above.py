@@ -14,7 +14,7 @@ from PIL import Image
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial import cKDTree
 
-from segslam.core.types import Points, Vector
+from segslam.core.types import Indices, Points, Vector
 
 DPI = 100
 PATH = "#d62728"
@@ -22,6 +22,8 @@ SMALL_PX = 1500
 """Chosen: a little more than the width of the report."""
 LEGEND_PX, LEAST_PX = 190, 700
 """Chosen: width of the legend, and smallest width of the map."""
+NUM_CELLS = 256
+"""Chosen: number of cells in x and in y that show without a search that most points are not over the path."""
 Window = tuple[float, float, float, float]
 """West, east, south and north end of a top view (m)."""
 BESIDE_M = 0.5
@@ -150,14 +152,24 @@ def free_heights(path_m: Points, clouds: Iterable[Points]) -> Vector:
     tree = cKDTree(path_m[:, :2])
     free_m = np.full(len(path_m), np.inf)
     lowest_m = path_m[:, 2].min()
+    is_near = np.zeros((NUM_CELLS, NUM_CELLS), bool)
+    for beside_m in np.indices((3, 3, 1)).reshape(3, -1).T - 1.0:
+        is_near[_cells(path_m + beside_m)] = True
     for cloud in clouds:
-        points = cloud[cloud[:, 2] > lowest_m + LOWEST_M]  # others are over no position
+        high = cloud[cloud[:, 2] > lowest_m + LOWEST_M]  # others are over no position
+        points = high[is_near[_cells(high)]]  # others are 1 m away or more
         away_m, row = tree.query(points[:, :2], distance_upper_bound=BESIDE_M)
         beside = np.isfinite(away_m)
         above_m = points[beside, 2] - path_m[row[beside], 2]
         over = above_m > LOWEST_M
         np.minimum.at(free_m, row[beside][over], above_m[over])
     return free_m
+
+
+def _cells(points: Points) -> tuple[Indices, Indices]:
+    """The cell of 1 m of each point, in x and in y; cells repeat every `NUM_CELLS`."""
+    x, y = np.floor(points[:, :2].T).astype(np.int64) % NUM_CELLS
+    return x, y
 
 
 def visible(points: Points, path_m: Points, cut_m: Vector) -> np.ndarray:

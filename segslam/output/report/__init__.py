@@ -35,6 +35,7 @@ def write_report(folder: str | Path) -> Path:
     run = read_run(folder)
     log = read_log(folder)
     drawings: list[Callable[[FinishedRun], Any]] = [_plots, _pictures]
+    loops.packed_plotly()  # kept here, not in the copy that writes it: other reports may follow
     plots, (top, gallery) = in_parts(drawings, lambda part: [draw(run) for draw in part])
     about = {**log.run, "segslam": log.packages.get("segslam", "unknown version")}
     file = folder / "report.html"

@@ -17,8 +17,9 @@ from segslam.core.memory import give_back, keep_freed_memory
 from segslam.core.types import SegslamError
 
 logger = logging.getLogger(__name__)
-IDLE_S = 0.2
-"""Chosen: CPU time of a task that found its result there; it freed no memory, and a collection takes half of this."""
+SHORT_S = 1.5
+"""Chosen: CPU time of a task that leaves little behind: it found its result there, or that two drives share no place.
+A collection takes 0.1 s."""
 
 
 class Outcome(NamedTuple):
@@ -49,7 +50,7 @@ def attempted(function: Callable[..., Any], *arguments: Any) -> Outcome:
         logger.exception("%s failed", function.__name__)
         return Outcome(None, f"{type(error).__name__}: {error}")
     finally:
-        if process_time() - started_s > IDLE_S:
+        if process_time() - started_s > SHORT_S:
             gc.collect()
             give_back()
 

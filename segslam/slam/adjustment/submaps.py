@@ -23,8 +23,9 @@ from segslam.slam.adjustment.alignment import SEARCH_M, Alignment, PointsOf, ali
 
 REACH = 2
 """Chosen on KITTI 00: number of keyframes before and after one that are in its submap."""
-MOST_SUBMAPS = 16
-"""Chosen: submaps in memory, about 1.5 MB each; a drive needs 6, and 2 more for each other pass beside it."""
+MOST_SUBMAPS = 20
+"""Chosen: submaps in memory, about 1.5 MB each; a drive needs 6, and 2 more for each other pass beside it. With 16 a
+sixth more were made for four simulated drives of one town; with 64 as many as with 20."""
 EVERY = 2
 """Chosen on KITTI 00: a submap is registered for every n-th keyframe."""
 STEPS = (5, 10)

@@ -54,6 +54,13 @@ def test_the_process_that_aligns_scans_imports_no_large_library_but_kiss_icp() -
     assert set(json.loads(ended.stdout)) & HEAVY == {"kiss_icp"}
 
 
+def test_runs_are_read_and_begun_without_the_statistics_of_scipy() -> None:
+    """A third of a second; of the functions there, one is needed, at the end of a run."""
+    code = "import json, sys; import segslam.output.finished, segslam.run.run; print(json.dumps(sorted(sys.modules)))"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "scipy.stats" not in json.loads(ended.stdout)
+
+
 FIRST_WORD = """
 import io, os, sys, json
 from segslam.cli import main

@@ -19,7 +19,7 @@ from statistics import median
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from segslam.core import geometry
 from segslam.core.config import Config
@@ -39,9 +39,9 @@ ANYWHERE = geometry.tangent(rotation_rad=np.radians(60.0), translation_m=ELSEWHE
 """Chosen: standard deviations of a motion that no pose explains: the sensor may have been carried anywhere nearby."""
 SHARED = np.diag(geometry.tangent(rotation_rad=math.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M) ** 2)
 """Covariance of the errors that all points of a scan have in common."""
-MOST_OFF = float(chi2.isf(SIGNIFICANT, 6))
+MOST_OFF = float(chdtri(6, SIGNIFICANT))
 """Chi-square above which a pose of the odometry is significantly off the registered one."""
-MOST_OFF_TOGETHER = float(chi2.isf(SIGNIFICANT, 6 * WINDOW))
+MOST_OFF_TOGETHER = float(chdtri(6 * WINDOW, SIGNIFICANT))
 """Sum of these chi-squares above which an odometry is less sure than the registrations of its last scans."""
 MOST_UNCHECKED = 9
 """Chosen: number of scans after which a sensor that seems to stand still is checked."""

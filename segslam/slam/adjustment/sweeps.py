@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import brentq
-from scipy.stats import t as student
+from scipy.special import stdtr
 
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
@@ -144,7 +144,7 @@ def measure_sweep(
         return None
     best = int(np.argmax(first.gain))
     seconds, from_deg = float(first.value[best]), float(FROM_DEG[best])
-    chance = len(FROM_DEG) * 2.0 * student.sf(abs(seconds) / first.sigma[best], first.num_pairs - 1)
+    chance = len(FROM_DEG) * 2.0 * stdtr(first.num_pairs - 1, -abs(seconds) / first.sigma[best])
     if not chance < SIGNIFICANT:  # nor if it is unknown
         return None
 

@@ -7,7 +7,6 @@ are right. The patch and its normal come from one scan alone, so that a bad pose
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.stats import wilcoxon
 
 from segslam.core import geometry
 from segslam.core.points import cell_keys, group_moments, within_range
@@ -55,6 +54,8 @@ def median_m(thickness_m: Sequence[Vector]) -> float | None:
 
 def is_thicker(before_m: Sequence[Vector], after_m: Sequence[Vector]) -> bool:
     """True if the same pairs of scans show significantly thicker surfaces afterwards (signed ranks of Wilcoxon)."""
+    from scipy.stats import wilcoxon  # takes a third of a second; logs are read without it
+
     medians = [
         (np.median(before), np.median(after))
         for before, after in zip(before_m, after_m, strict=True)

@@ -169,7 +169,8 @@ def relate(fleet: Path, later: Mapped, earlier: Mapped, queries: Sequence[int]) 
     """The pose of a drive in an earlier one, from its keyframes that look like places there."""
     file = fleet / PAIRS / f"{later.name} at {earlier.name}-{key_of(later.key, earlier.key, queries)}.json"
     if not file.exists():
-        session, locator = _session(fleet, later), _locator(_session(fleet, earlier))
+        locator = _locator(_session(fleet, earlier))
+        session = _session(fleet, later)  # the last one that is read: the next step needs it again
         relation = find_session(session, locator, config=locator.config, likely=queries)
         _replace(file, partial(write_kept, kind=Relation, value=relation))
     return read_kept(file, Relation)

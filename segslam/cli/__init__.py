@@ -109,7 +109,9 @@ def _of_file(error: OSError) -> str:
         return f"standard output: cannot be written ({reason(error)}); redirect it elsewhere"
     if isinstance(error, FileNotFoundError) and error.filename:
         return f"{error.filename}: no such file or folder; give a path that exists"
-    return f"{error.filename or 'output'}: cannot be read or written ({reason(error)})"
+    return (
+        f"{error.filename or 'output'}: cannot be read or written ({reason(error)}); check the path and its permissions"
+    )
 
 
 def _flushed(status: int) -> int:

@@ -11,13 +11,20 @@ from segslam.core.interrupts import removed_when_stopped
 
 
 def expanded(path: str | Path) -> Path:
-    """The path with the home folder in place of `~`. Raises SegslamError for a user who does not exist, and no path."""
+    """The path with the home folder in place of `~`.
+
+    Raises SegslamError for a user who does not exist, for a name that is too long, and for what is no path.
+    """
     try:
-        return Path(path).expanduser()
+        whole = Path(path).expanduser()
+        whole.exists()  # raises if no call of the system takes the name
+        return whole
     except RuntimeError as error:
         raise SegslamError(f"{brief(str(path))}: there is no user with this name; write the folder in full") from error
     except TypeError as error:
         raise SegslamError(f"{brief(repr(path))}: not a path; give a text or a Path") from error
+    except OSError as error:
+        raise SegslamError(f"{brief(str(path))}: {reason(error)}; give another path") from error
 
 
 def all_expanded(paths: str | Path | Iterable[str | Path]) -> list[Path]:

@@ -108,6 +108,17 @@ def test_an_empty_path_is_not_the_present_folder(
     assert run("map", scans, "--dry-run", "--topic", "", "-q") == 0  # the default
 
 
+@pytest.mark.parametrize("command", [("map", "LONG", "--out", "run"), ("info", "LONG"), ("map", ".", "--out", "LONG")])
+def test_a_name_that_is_too_long_is_refused_in_one_line(
+    command: tuple[str, ...], scans: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(scans)
+    for name in ("n" * 300, "p/" * 2500):
+        assert run(*(word.replace("LONG", name) for word in command)) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert line.endswith("(File name too long); check the path and its permissions")
+
+
 @pytest.mark.parametrize("option", [("--gnss-use", "align"), ("--gnss-offset", "5"), ("--gnss-offset", "nan")])
 def test_options_of_position_fixes_are_refused_without_fixes(
     option: tuple[str, str], scans: Path, capsys: pytest.CaptureFixture[str]

@@ -169,10 +169,15 @@ def check_same(recorded: "RunLog", settings: "Config", *, dataset: str, options:
             )
 
 
+def has_results(recorded: "RunLog") -> bool:
+    """True if the run has all its results, for the scans in its log."""
+    return recorded.result() is not None and (recorded.path.parent / "report.html").is_file()  # written last
+
+
 def is_finished(recorded: "RunLog", scans: "Dataset") -> bool:
     """True if the run has all its results, for all scans of the data set that can be read."""
     result = recorded.result()
-    if result is None or not (recorded.path.parent / "report.html").is_file():  # the last file that a run writes
+    if result is None or not has_results(recorded):
         return False
     last = int(result[1].scan_index[-1])  # scans are read only if the last one is missing
     return last == int(scans.scan_index[-1]) or last == int(scans.scan_index[first_usable(scans, backwards=True)[0]])

@@ -16,6 +16,7 @@ from segslam.cli.checks import (
     check_preset,
     check_same,
     check_scans,
+    has_results,
     is_finished,
     log_to_resume,
     make_folder,
@@ -93,12 +94,16 @@ def resume(
     """
     check_exists(run, "give a run folder")
     terminal.announce(f"resume: reading {run}")
+    from segslam.output.finished import read_metrics
     from segslam.output.folder import folder_of
 
     run = folder_of(run)
     recorded = log_to_resume(run)
     chosen: dict[str, Any] = {name: value for name, value in recorded.options.items() if value}
     again = f"segslam map DATA --out {shlex.quote(str(run))} --resume"
+    if "data" not in chosen and has_results(recorded) and not read_metrics(run).get("num_scans_left"):
+        _show_complete(recorded, [], terminal, config=recorded.config.map, place=None)  # live, merged or replayed
+        return
     if why := why_not_resumed(chosen, run):
         raise SegslamError(f"{recorded.path}: {why}")
     if "data" not in chosen:

@@ -137,6 +137,20 @@ def test_a_run_is_finished_though_its_last_scan_cannot_be_read(tmp_path: Path) -
     assert not is_finished(recorded, longer)
 
 
+def test_a_finished_run_that_needs_no_data_is_complete(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A live run, a merged one, a replay; but not a replay that Ctrl-C ended."""
+    folder = make_run(tmp_path / "run").folder
+    assert run("resume", folder) == 2, "there is no report yet"
+    (folder / "report.html").write_text("")
+    capsys.readouterr()
+    assert run("resume", folder, "--json") == 0
+    shown = capsys.readouterr()
+    assert "the run is already complete" in shown.err
+    assert json.loads(shown.out)["num_scans"] == 120
+    (folder / "metrics.json").write_text('{"num_scans_left": 3}')
+    assert run("resume", folder) == 2
+
+
 @pytest.mark.parametrize(
     "options",
     [{"live": "folder"}, {"sessions": "[1]"}, {"data": "scans", "python": "odometry"}, {"data": "scans", "python": ""}],

@@ -277,7 +277,7 @@ def test_representations_are_short_and_say_what_matters(made: MadeRun, tmp_path:
     assert set(repr(changed)[7:-1].split(", ")) == {"verify.max_false_share=0.01", "graph.final='gnc'"}
     slam = segslam.Slam()
     slam.process(round_drive()[0][0])
-    assert repr(slam) == "Slam(1 scans, 1 keyframes, 0 loops, running)"
+    assert repr(slam) == "Slam(1 scan, 1 keyframe, 0 loops, running)"
     write_kitti_sequence(tmp_path / "kitti", num_scans=3)
     scans = segslam.open_dataset(tmp_path / "kitti")
     assert repr(scans) == f"KittiSequence({scans.name!r}, 3 scans)"

@@ -12,6 +12,7 @@ from time import monotonic
 import numpy as np
 
 from segslam.core.config import Config, check_config
+from segslam.core.errors import counted
 from segslam.core.memory import give_back
 from segslam.core.threads import Stopwatch
 from segslam.core.trajectory import corrected_poses
@@ -90,9 +91,10 @@ class Slam:
         self._result: SlamResult | None = None
 
     def __repr__(self) -> str:
-        loops = sum(isinstance(attempt.outcome, LoopClosure) for attempt in self._attempts)
+        num_loops = sum(isinstance(attempt.outcome, LoopClosure) for attempt in self._attempts)
+        numbers = {"scan": len(self._steps), "keyframe": len(self._keyframe_rows), "loop": num_loops}
         state = "finished" if self._is_finished else "running"
-        return f"Slam({len(self._steps)} scans, {len(self._keyframe_rows)} keyframes, {loops} loops, {state})"
+        return f"Slam({', '.join(counted(number, thing) for thing, number in numbers.items())}, {state})"
 
     def _new_graph(self) -> Graph:
         return PoseGraph(self.config.graph)

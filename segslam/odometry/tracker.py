@@ -8,7 +8,7 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.errors import LateScan
+from segslam.core.errors import BadScan, LateScan
 from segslam.core.threads import Stopwatch
 from segslam.core.trajectory import Poses
 from segslam.core.types import Indices, Motion, MotionState, Scan, Step, Transform
@@ -49,7 +49,8 @@ class Tracker:
         self._selector = KeyframeSelector(config.keyframes)
         self._T_odom_own = np.eye(4)
         """Pose of the frame of the odometry, which starts again after `resume`."""
-        self._num_tracked = 0
+        self._next_index = 0
+        self._indices = set[int]()
         self._last_stamp_ns: int | None = None
 
     def track(self, scan: Scan, *, gap: float = 1.0, ahead: Scan | None = None) -> Tracked:
@@ -58,21 +59,23 @@ class Tracker:
         `gap`: time since the previous scan in intervals of the sensor; above 1 if scans between them were lost. It
         scales the constant-velocity prediction of the odometry. `ahead`: the scan that is tracked next, without a gap,
         if it is known; the odometry then works on both at the same time, with the same results. Raises BadScan, and
-        ignores the scan, if it cannot be used or is not later than the previous scan.
+        ignores the scan, if it cannot be used, is not later than the previous scan, or has the index of another.
         """
-        index = self._num_tracked if scan.index is None else scan.index
+        index = self._next_index if scan.index is None else scan.index
         if self._last_stamp_ns is not None and scan.stamp_ns <= self._last_stamp_ns:
             raise LateScan(
                 f"scan {index}: its stamp {scan.stamp_ns} ns is not later than that of the previous scan, "
                 f"{self._last_stamp_ns} ns; give each scan once, in order of time and by one clock"
             )
+        if index in self._indices:
+            raise BadScan(f"scan {index}: an earlier scan has this index; give each its own, or none to any")
         scan = replace(scan, index=index)
         watch = Stopwatch()
         with watch("odometry"):
             registered = self._odometry.register(scan, gap=gap, ahead=ahead)
         registered = replace(registered, T_odom_lidar=self._T_odom_own @ registered.T_odom_lidar)
         self._last_stamp_ns = scan.stamp_ns
-        self._num_tracked += 1
+        self._note_index(index)
         T_odom_lidar = registered.T_odom_lidar
         motion = registered.motion or Motion(MotionState.UNCHECKED)
         is_keyframe = self._selector.update(T_odom_lidar, after_break=motion.is_break)
@@ -93,7 +96,11 @@ class Tracker:
         motion = recorded.motion or Motion(MotionState.UNCHECKED)
         self._selector.update(recorded.T_odom_lidar, after_break=motion.is_break)
         self._last_stamp_ns = recorded.stamp_ns
-        self._num_tracked = recorded.scan_index + 1
+        self._note_index(recorded.scan_index)
+
+    def _note_index(self, index: int) -> None:
+        self._indices.add(index)
+        self._next_index = index + 1
 
     def resume(self, T_odom_lidar: Poses, stamps_ns: Indices, scan_of: Callable[[int], Scan]) -> None:
         """Continue after noted scans, with these poses and stamps; `scan_of` reads the scan of a row.

@@ -106,8 +106,8 @@ class Slam:
     def process(self, scan: Scan) -> Step:
         """Process one scan; returns a Step with all results that it caused.
 
-        Raises BadScan, and ignores the scan, if it cannot be used or is not later than the previous scan. Raises
-        SegslamError after `finish`.
+        Raises BadScan, and ignores the scan, if it cannot be used, is not later than the previous scan, or has the
+        index of another. Raises SegslamError after `finish`.
         """
         return self.close_loops(self.track(scan))
 

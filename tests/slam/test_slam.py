@@ -142,6 +142,17 @@ def test_a_scan_that_is_not_later_than_the_last_is_refused_and_forgotten() -> No
     assert slam.finish().trajectory.scan_index.tolist() == [1, 2]
 
 
+def test_a_second_scan_with_an_index_is_refused_and_forgotten() -> None:
+    scans = round_drive()[0][:4]
+    slam = drifting_slam()
+    slam.process(scans[1])
+    with pytest.raises(BadScan, match="scan 1: an earlier scan has this index; give each its own"):
+        slam.process(replace(scans[2], index=1))
+    slam.process(replace(scans[2], index=None))
+    slam.process(scans[3])
+    assert slam.finish().trajectory.scan_index.tolist() == [1, 2, 3]
+
+
 def test_no_scan_is_taken_after_the_end() -> None:
     scans = round_drive()[0][:2]
     slam = drifting_slam()

@@ -273,6 +273,27 @@ def test_nothing_mapped_is_an_error_with_the_first_reason(
     assert "--workers: " in capsys.readouterr().err
 
 
+def test_missing_files_of_a_drive_are_named_before_the_others_are_mapped(
+    recordings: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = list[str]()
+
+    def mapped(_: Path, drive: Drive) -> None:
+        said.append(f"map {drive.name}")
+        raise SegslamError("not now")
+
+    monkeypatch.setattr(steps, "map_drive", mapped)
+    drives = [
+        Drive("friday", str(recordings[3])),
+        Drive("gone", "/no/where"),
+        Drive("x", str(recordings[0]), config="/no.y"),
+    ]
+    with pytest.raises(SegslamError, match="no drive could be mapped"):
+        fleet(drives, tmp_path / "city", num_workers=1, say=said.append)
+    missing = [f"{what}: no such file or folder; the others go on" for what in ("gone: /no/where", "x: /no.y")]
+    assert said[:3] == [*missing, "map friday"]
+
+
 def test_a_component_of_one_drive_is_shown_without_loops(
     recordings: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -125,6 +125,24 @@ def test_a_benchmark_does_not_wait_for_a_scheduler_without_workers(
         next(run(job, trials, scheduler=address))
 
 
+@pytest.mark.long
+def test_a_scheduler_that_loses_its_last_worker_is_reported_with_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Dask waits for another one without end."""
+    monkeypatch.setattr("segslam.run.fleets.workers.LOOK_EVERY_S", 0.2)
+    with (
+        scheduler(tmp_path, has_worker=True) as (_, address),
+        workers(tmp_path, number=1, scheduler=address) as (_, _),
+        distributed.Client(address) as client,
+    ):
+        client.retire_workers()
+        end = time.monotonic() + 20
+        while not caplog.messages and time.monotonic() < end:
+            time.sleep(0.1)
+    assert caplog.messages == [f"--scheduler {address}: no worker is left; start `dask worker {address}` to go on"]
+
+
 STOPPED = """
 import sys, time
 from pathlib import Path

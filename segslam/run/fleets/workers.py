@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from threading import Event, Thread
 from time import process_time
 from typing import Any, NamedTuple
 from uuid import uuid4
@@ -20,6 +21,9 @@ logger = logging.getLogger(__name__)
 SHORT_S = 1.5
 """Chosen: CPU time of a task that leaves little behind: it found its result there, or that two drives share no place.
 A collection takes 0.1 s."""
+
+LOOK_EVERY_S = 5.0
+"""Chosen: pause between two looks at the workers of a scheduler; a nanny replaces a worker that died within it."""
 
 
 class Outcome(NamedTuple):
@@ -93,7 +97,7 @@ def cluster(shared: Path, *, workers: int, scheduler: str | None) -> Iterator[An
             client = Client(scheduler, timeout=5)
         except (OSError, ValueError) as error:
             raise SegslamError(f"--scheduler {scheduler}: no answer ({error}); start `dask scheduler`") from error
-        with client:
+        with client, _watched(client, scheduler):
             _check(client, shared, scheduler)
             yield client
         return
@@ -110,6 +114,30 @@ def cluster(shared: Path, *, workers: int, scheduler: str | None) -> Iterator[An
         finally:
             for one in logs:
                 one.setLevel(logging.CRITICAL)  # after Ctrl-C they report each worker that is ended amid a task
+
+
+@contextmanager
+def _watched(client: Any, scheduler: str) -> Iterator[None]:
+    """Context manager that warns when a scheduler has lost its last worker: Dask then waits for another one."""
+    ended = Event()
+
+    def watch() -> None:
+        had_workers = True
+        while not ended.wait(LOOK_EVERY_S):
+            has_workers = bool(client.scheduler_info()["workers"])
+            if had_workers and not has_workers:
+                logger.warning(
+                    "--scheduler %s: no worker is left; start `dask worker %s` to go on", scheduler, scheduler
+                )
+            had_workers = has_workers
+
+    thread = Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join(LOOK_EVERY_S)
 
 
 def _check(client: Any, shared: Path, scheduler: str | None) -> None:

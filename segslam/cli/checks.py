@@ -25,10 +25,8 @@ def check_exists(path: Path, hint: str) -> None:
 
 
 def check_scans(data: Path) -> None:
-    """Raises SegslamError if there is no such data, or if it is the folder of a run, whose map is no scan."""
+    """Raises SegslamError if there is no such data."""
     check_exists(data, "give the folder with sequences/ or with the scans")
-    if all((data.expanduser() / name).is_file() for name in ("log.mcap", "config.yaml")):
-        raise SegslamError(f"{data}: the folder of a run; give the data that it was made from")
 
 
 def check_run(run: Path) -> None:

@@ -121,10 +121,12 @@ class DataSource:
     vertical_angle_deg: float | None = None
 
     def open(self) -> Dataset:
-        """The data set, as `open_dataset` opens it."""
+        """The data set, as `open_dataset` opens it; the folder of a run is none, though its map may be a scan file."""
         folder = expanded(self.data)
         if not folder.exists():
             raise SegslamError(f"{folder}: no such file or folder; give the folder with sequences/ or with the scans")
+        if all((folder / name).is_file() for name in ("log.mcap", "config.yaml")):
+            raise SegslamError(f"{folder}: the folder of a run; give the data that it was made from")
         if self.encoding not in (None, *ENCODINGS):
             raise SegslamError(f"encoding {self.encoding}: unknown; known: {', '.join(ENCODINGS)}")
         sensor = validated(SensorCalibrationConfig, {"vertical_angle_deg": self.vertical_angle_deg}, str(folder))

@@ -40,12 +40,12 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("command", ["map", "calibrate"])
+@pytest.mark.parametrize("command", ["map", "calibrate", "fleet", "label --labels geometric"])
 def test_a_run_is_no_data(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Its map.ply was mapped as a scan."""
     folder = make_run(tmp_path / "run").folder
     (folder / "map.ply").write_bytes(b"")
-    assert run(command, folder, *(("--out", tmp_path / "other") if command == "map" else ())) == 2
+    assert run(*command.split(), folder, *(() if command == "calibrate" else ("--out", tmp_path / "other"))) == 2
     assert f"{folder}: the folder of a run; give the data that it was made from" in capsys.readouterr().err
 
 

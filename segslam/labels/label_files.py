@@ -5,7 +5,6 @@ A network's labels are computed on first use: it is slow, and only keyframes nee
 
 import logging
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -140,15 +139,20 @@ def write_labels(file: Path, labels: Labels, kept: Mask | None, encoding: Encodi
 
 
 def encoding_of(files: Sequence[Path]) -> Encoding:
-    """The encoding of label files, detected from all of them. Raises SegslamError if it is ambiguous."""
+    """The encoding of label files, detected from all of them. Raises SegslamError if it is ambiguous or unknown."""
     num_points_of_id = np.zeros(2**16, np.int64)
+    why = "no file has a label; give the .label files of the scans"
     for file in files:
-        with suppress(BadScan):  # of an invalid file, which is reported when its scan is read
+        try:
             num_points_of_id += np.bincount(read_ids(file), minlength=2**16)
+        except BadScan as error:  # if other files are valid, it is reported when its scan is read
+            why = str(error)
+    where = files[0].parent if len(files) > 2 else " and ".join(str(file) for file in files)
+    if not num_points_of_id.any():
+        raise SegslamError(f"{where}: the numbering of the classes cannot be detected: {why}")
     try:
         return detect_encoding(num_points_of_id)
     except SegslamError as error:
-        where = files[0].parent if len(files) > 2 else " and ".join(str(file) for file in files)
         raise SegslamError(f"{where}: {error}") from error
 
 

@@ -28,6 +28,8 @@ MIN_BYTES = 32
 """Fewest bytes of a message with a cloud, compressed or not: its record header and stamp."""
 DAMAGE = (McapError, ValueError, OverflowError, struct.error)
 """Exceptions of the library for damaged records."""
+MAGIC = b"\x89MCAP0\r\n"
+"""First bytes of an MCAP file."""
 DAMAGED_INDEX = "the index of the file is damaged"
 
 
@@ -124,8 +126,8 @@ class McapMessages:
     """Messages of one kind, by their order in time; replaces kiss_icp's reader, which fails with mcap-ros2-support 0.6.
 
     A message in a damaged chunk cannot be read; the others can. In a file without chunks, or without an index of their
-    messages, none after the damage can. Raises ValueError if the file has no index, SegslamError if it has no such
-    topic, ImportError if the decoding package is missing.
+    messages, none after the damage can. Raises ValueError if the file has no index, SegslamError if it is no MCAP file
+    or has no such topic, ImportError if the decoding package is missing.
     """
 
     def __init__(self, file: Path, topic: str, *, kind: str = CLOUD, option: str = "--topic") -> None:
@@ -137,6 +139,9 @@ class McapMessages:
         self._file = file
         self._chunk: tuple[int, bytes] = (-1, b"")
         with file.open("rb") as stream:
+            if stream.read(len(MAGIC)) != MAGIC:
+                raise SegslamError(f"{file}: cannot be opened as MCAP, it is empty or of another kind; copy it again")
+            stream.seek(0)
             summary = _summary(stream)
             assert summary.statistics is not None
             known = [one for one in summary.channels.values() if one.schema_id]

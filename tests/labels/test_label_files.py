@@ -154,9 +154,13 @@ def test_the_home_of_an_unknown_user_is_refused(tmp_path: Path, source: str) -> 
         open_labels(source, beside=tmp_path, scan_names=NAMES, encoding=None)
 
 
-def test_files_without_any_label_do_not_decide_the_encoding(tmp_path: Path) -> None:
-    (tmp_path / "000000.label").write_bytes(b"123")
-    with pytest.raises(SegslamError, match="cannot be detected"):
+@pytest.mark.parametrize(
+    ("content", "why"), [(b"123", r"000000\.label: 3 bytes are not a multiple of 4"), (b"", "no file has a label")]
+)
+def test_files_without_any_label_do_not_decide_the_encoding(tmp_path: Path, content: bytes, why: str) -> None:
+    """The reason is that of the files: --encoding would not help."""
+    (tmp_path / "000000.label").write_bytes(content)
+    with pytest.raises(SegslamError, match=f"cannot be detected: .*{why}"):
         encoding_of([tmp_path / "000000.label"] * 3)
 
 

@@ -22,6 +22,7 @@ from helpers.recorded_drive import (
 from segslam.core.evaluation import trajectory_metrics
 from segslam.core.trajectory import read_poses
 from segslam.core.types import SegslamError
+from segslam.gnss.reading import read_fixes
 from segslam.scans import open_dataset
 
 pytestmark = pytest.mark.usefixtures("short_runs")
@@ -80,6 +81,18 @@ def test_a_recording_without_an_index_is_reported_with_the_remedy(tmp_path: Path
     recording.write_bytes(recording.read_bytes()[:-100])
     with pytest.raises(SegslamError, match=r"drive\.mcap: .*no index.*mcap recover"):
         open_dataset(recording, topic=TOPIC)
+
+
+@pytest.mark.parametrize("content", [b"", b"a text\n"])
+def test_another_file_with_the_name_of_a_recording_is_not_taken_for_a_damaged_one(
+    content: bytes, tmp_path: Path
+) -> None:
+    (tmp_path / "drive.mcap").write_bytes(content)
+    for read in (open_dataset, read_fixes):
+        with pytest.raises(
+            SegslamError, match=r"drive\.mcap: cannot be opened as MCAP, it is empty or of another kind; copy it again"
+        ):
+            read(tmp_path / "drive.mcap")
 
 
 @pytest.mark.slow

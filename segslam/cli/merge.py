@@ -39,7 +39,7 @@ def merge(
     if not changes.overwrite:
         check_new(out)
     changes.load()  # reports a wrong setting before the logs are read
-    terminal.announce(f"merge: reading {len(runs)} runs")
+    terminal.announce(f"merge: reading {counted(len(runs), 'run')}")
     from segslam.run.sessions.merge import plan
     from segslam.run.sessions.recorded import read_sessions
 
@@ -93,7 +93,10 @@ def fleet(
     from segslam.run.fleets.orchestrate import fleet as run_fleet
 
     changes.load()  # reports a wrong setting before anything is mapped
-    if len(drives) == 1 and drives[0].suffix.lower() in (".yaml", ".yml"):
+    lists = [path for path in drives if path.suffix.lower() in (".yaml", ".yml")]
+    if lists and len(drives) > 1:
+        raise SegslamError(f"{lists[0]}: a list of drives; give it alone, with all drives in it")
+    if lists:
         if changes.config is not None:
             raise SegslamError("--config: give it for each drive in the list, as config: FILE.yaml")
         listed = read_drives(drives[0])

@@ -13,7 +13,7 @@ from segslam.core.errors import counted, unreadable
 from segslam.core.trajectory import PoseFormat, lidar_from_camera, read_poses, rows_of_same_stamp
 from segslam.core.types import LoopAttempt, Motion, SegslamError, Trajectory, Transform
 from segslam.core.whole_files import expanded
-from segslam.output.folder import ALONE, folder_of, read_alone, read_localised
+from segslam.output.folder import ALONE, LOG, folder_of, read_alone, read_localised
 from segslam.output.log import RunLog, read_log
 from segslam.output.words import FIGURES
 from segslam.slam.adjustment import Correction, corrections_of, velocities_of
@@ -84,7 +84,8 @@ def read_metrics(folder: Path) -> dict[str, Any]:
     try:
         return _checked_metrics(json.loads(file.read_text(encoding="utf-8")))
     except (OSError, ValueError, RecursionError) as error:
-        raise SegslamError(f"{unreadable(file, 'figures of the run', error)}; replay its log.mcap") from error
+        remedy = f"replay its {LOG}" if (folder / LOG).exists() else "give a folder made by `segslam map --out`"
+        raise SegslamError(f"{unreadable(file, 'figures of the run', error)}; {remedy}") from error
 
 
 def plain_name(key: str) -> str:

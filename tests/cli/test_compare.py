@@ -67,6 +67,7 @@ def test_figures_and_picture_of_several_runs(
     ("second", "options", "expected"),
     [
         ("nowhere", (), "nowhere: no such file or folder"),
+        (".", (), "metrics.json: no such file; give a folder made by `segslam map --out`"),
         ("one", (), "two or more different runs"),
         ("two", ("--plot", "both.doc"), "both.doc: unknown kind of figure"),
         ("two", ("--plot", "nowhere/both.png"), "there is no folder nowhere"),

@@ -55,3 +55,5 @@ def test_a_wrong_setting_or_table_is_reported_before_anything_is_replayed(
     assert run("sweep", log, "--set", setting, "--out", tmp_path / "no", "--csv", tmp_path / "nowhere" / "t.csv") == 2
     assert "there is no folder" in capsys.readouterr().err
     assert not list((tmp_path / "no").iterdir())
+    assert run("sweep", log, "--set", setting, "--out", log) == 2
+    assert f"{log}: cannot be written (File exists); give another with --out" in capsys.readouterr().err

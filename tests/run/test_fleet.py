@@ -269,6 +269,9 @@ def test_nothing_mapped_is_an_error_with_the_first_reason(
     assert run("fleet", recordings[2], "--out", tmp_path / "none", "-q") == 2
     assert "no drive could be mapped; damaged: " in capsys.readouterr().err
     assert run("fleet", tmp_path / "nothing.yaml", "--out", tmp_path / "none") == 2
+    (tmp_path / "some.yaml").write_text("- monday\n")
+    assert run("fleet", tmp_path / "some.yaml", recordings[0], "--out", tmp_path / "none") == 2
+    assert "some.yaml: a list of drives; give it alone" in capsys.readouterr().err
     assert run("fleet", recordings[0], "--out", tmp_path / "x", "--scheduler", "tcp://x:1", "--workers", "2") == 2
     assert "--workers: " in capsys.readouterr().err
 

@@ -1,5 +1,6 @@
 """Paths as users give them, their texts, and atomic writing: a file appears when it is complete, or not at all."""
 
+import errno
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -17,14 +18,16 @@ def expanded(path: str | Path) -> Path:
     """
     try:
         whole = Path(path).expanduser()
-        whole.exists()  # raises if no call of the system takes the name
-        return whole
     except RuntimeError as error:
         raise SegslamError(f"{brief(str(path))}: there is no user with this name; write the folder in full") from error
     except TypeError as error:
         raise SegslamError(f"{brief(repr(path))}: not a path; give a text or a Path") from error
+    try:
+        whole.exists()
     except OSError as error:
-        raise SegslamError(f"{brief(str(path))}: {reason(error)}; give another path") from error
+        if error.errno == errno.ENAMETOOLONG:
+            raise SegslamError(f"{brief(str(path))}: {reason(error)}; give another path") from error
+    return whole
 
 
 def all_expanded(paths: str | Path | Iterable[str | Path]) -> list[Path]:

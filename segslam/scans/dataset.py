@@ -125,8 +125,6 @@ class DataSource:
         folder = expanded(self.data)
         if not folder.exists():
             raise SegslamError(f"{folder}: no such file or folder; give the folder with sequences/ or with the scans")
-        if all((folder / name).is_file() for name in ("log.mcap", "config.yaml")):
-            raise SegslamError(f"{folder}: the folder of a run; give the data that it was made from")
         if self.encoding not in (None, *ENCODINGS):
             raise SegslamError(f"encoding {self.encoding}: unknown; known: {', '.join(ENCODINGS)}")
         sensor = validated(SensorCalibrationConfig, {"vertical_angle_deg": self.vertical_angle_deg}, str(folder))
@@ -134,6 +132,8 @@ class DataSource:
         from segslam.scans.kitti import KittiSequence, is_kitti
 
         try:
+            if all((folder / name).is_file() for name in ("log.mcap", "config.yaml")):
+                raise SegslamError(f"{folder}: the folder of a run; give the data that it was made from")
             if self.dataset == "kitti" or (self.dataset is None and is_kitti(folder)):
                 if self.topic:
                     raise no_topics(self.topic)

@@ -88,7 +88,7 @@ def fleet(
         listed = [replace(drive, set=(*settings, *drive.set)) for drive in listed]
         for drive in listed:  # mapping the others takes hours
             for path in (drive.data, drive.odometry, drive.config):
-                if path and not expanded(path).exists():
+                if path and not os.path.exists(path):  # also without permission
                     say(f"{drive.name}: {path}: no such file or folder; the others go on")
         return _Fleet(folder, run, shown, say).run(listed, same_reference)
 

@@ -56,6 +56,9 @@ def main(arguments: list[str] | None = None) -> None:
 
     Exit status: 0 success, 1 no pose found, 2 wrong usage, bad input or full disk, 130 stopped by Ctrl-C or SIGTERM.
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by the shell, `>&-`: the next file would take its number
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
     with ctrl_c_in_order():
         sys.exit(_status(arguments))
 

@@ -240,6 +240,16 @@ def test_a_closed_pipe_is_not_reported_as_an_error(finished: Path) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-"])
+def test_a_command_whose_output_is_closed_does_its_work(graph: Path, tmp_path: Path, closed: str) -> None:
+    command = f"{sys.executable} -m segslam optimize {graph} --json --out {tmp_path / 'a.g2o'}"
+    done = subprocess.run(["bash", "-c", f"{command} {closed}"], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("{") == (">&-" not in closed.split())
+    assert (tmp_path / "a.g2o").read_text().startswith("VERTEX")
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("command", [["report"], ["eval"], ["export"], ["view"], ["replay"]])
 def test_a_run_is_named_by_its_folder_or_its_log(
     finished: Path,

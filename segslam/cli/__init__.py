@@ -110,8 +110,8 @@ def _of_file(error: OSError) -> str:
     """Message with the file and the reason; standard output has no file name."""
     if error.filename is None and error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO):
         return f"standard output: cannot be written ({reason(error)}); redirect it elsewhere"
-    if isinstance(error, FileNotFoundError) and error.filename:
-        return f"{error.filename}: no such file or folder; give a path that exists"
+    if isinstance(error, FileNotFoundError):
+        return f"{error.filename or 'the present folder'}: no such file or folder; give a path that exists"
     return (
         f"{error.filename or 'output'}: cannot be read or written ({reason(error)}); check the path and its permissions"
     )

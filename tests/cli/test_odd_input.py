@@ -119,6 +119,16 @@ def test_a_name_that_is_too_long_is_refused_in_one_line(
         assert line.endswith("(File name too long); check the path and its permissions")
 
 
+def test_a_present_folder_that_was_removed_is_named(
+    scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert run("map", scans, "--out", "run") == 2
+    assert "segslam: the present folder: no such file or folder" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("option", [("--gnss-use", "align"), ("--gnss-offset", "5"), ("--gnss-offset", "nan")])
 def test_options_of_position_fixes_are_refused_without_fixes(
     option: tuple[str, str], scans: Path, capsys: pytest.CaptureFixture[str]

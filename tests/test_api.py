@@ -14,7 +14,7 @@ from helpers.drives import round_drive, write_kitti_sequence
 from helpers.finished_run import MadeRun, make_run
 
 import segslam
-from segslam.core.trajectory import read_poses, write_tum
+from segslam.core.trajectory import camera_from_lidar, read_poses, write_kitti, write_tum
 from segslam.output.finished import FinishedRun
 
 
@@ -150,6 +150,11 @@ def test_a_run_is_evaluated_exported_and_reported_by_public_names(made: MadeRun,
     ):
         assert segslam.evaluate(estimate, reference)["ate_m"] == pytest.approx(figures["ate_m"], rel=1e-4)
     assert segslam.evaluate(run, up=(0, 0, 2)) == figures
+    assert run.T_camera_lidar is not None
+    before = np.eye(4)[None].repeat(run.result.trajectory.scan_index[0], axis=0)  # the drive has scans before the run
+    of_camera = np.concatenate([before, camera_from_lidar(made.truth.T_world_lidar, run.T_camera_lidar)])
+    write_kitti(tmp_path / "poses.txt", of_camera)
+    assert segslam.evaluate(run, tmp_path / "poses.txt") == pytest.approx(figures, rel=1e-3, abs=1e-3)
     with pytest.raises(segslam.SegslamError, match="one for each"):
         segslam.evaluate(run.result.trajectory.T_world_lidar[:-1], made.truth.T_world_lidar)
     with pytest.raises(segslam.SegslamError, match="rpe_distance_m=0; give a distance above 0"):

@@ -10,7 +10,7 @@ from segslam.core.trajectory import PoseFile, Poses, as_poses, read_poses, rows_
 from segslam.core.types import SegslamError, Trajectory
 from segslam.core.whole_files import expanded
 from segslam.output.accuracy import Align, scores
-from segslam.output.finished import STAMP_TOLERANCE_NS, FinishedRun, read_run
+from segslam.output.finished import STAMP_TOLERANCE_NS, FinishedRun, read_run, true_poses
 from segslam.output.folder import folder_of
 
 Given = FinishedRun | Trajectory | Poses | str | Path
@@ -28,8 +28,10 @@ def evaluate(
     """The error figures of `segslam eval`: `ate_m` (rms, m), its mean, median and maximum, KITTI's errors and others.
 
     Poses of runs and trajectories are matched by scan number, those of TUM files by stamp (within 10 ms), all others
-    row by row. `reference` may be omitted for a run with ground truth. `align`, `rpe_distance_m` as for `--align` and
-    `--rpe-distance`; `up`: upward axis of the reference. Raises SegslamError if fewer than three poses match.
+    row by row. A file as reference of a run is read as `segslam eval` does: in KITTI format line n + 1 is scan n, and
+    its poses are those of the camera for KITTI's data. `reference` may be omitted for a run with ground truth. `align`,
+    `rpe_distance_m` as for `--align` and `--rpe-distance`; `up`: upward axis of the reference. Raises SegslamError if
+    fewer than three poses match.
     """
     if align not in get_args(Align):
         raise SegslamError(f"evaluate: align={align!r}: unknown; known: {', '.join(get_args(Align))}")
@@ -42,7 +44,7 @@ def evaluate(
         reference = made.reference if isinstance(made, FinishedRun) else None
         if reference is None:
             raise SegslamError("evaluate: no ground truth; give `reference`")
-    matched, truth = matched_poses(_poses(made), _poses(_read(reference)))
+    matched, truth = matched_poses(_poses(made), _poses(_read(reference, made)))
     x, y, z = (np.asarray(up) / np.linalg.norm(up)).tolist()
     figures = scores(matched, truth, align=align, rpe_distance_m=rpe_distance_m, up=(x, y, z))
     if not figures:
@@ -50,12 +52,15 @@ def evaluate(
     return figures
 
 
-def _read(given: Given) -> FinishedRun | Trajectory | PoseFile:
+def _read(given: Given, of: FinishedRun | Trajectory | PoseFile | None = None) -> FinishedRun | Trajectory | PoseFile:
+    """What is given; a file is the reference `of` a run, if there is one."""
     if isinstance(given, FinishedRun | Trajectory):
         return given
     if isinstance(given, str | Path):
         path = expanded(given)
-        return read_run(path) if folder_of(path).is_dir() else read_poses(path)
+        if folder_of(path).is_dir():
+            return read_run(path)
+        return true_poses(path, of) if isinstance(of, FinishedRun) else read_poses(path)
     return PoseFile(as_poses(given, "evaluate"), None)
 
 

@@ -241,6 +241,8 @@ WRONG_KINDS = {
     "segslam.read_run(made).result.errors('poses.txt')": "reference: poses.txt is no array",
     "segslam.fleet('~unknown-user/drives.yaml', 'fleet')": "there is no user with this name",
     "segslam.read_run('scan.bin')": "not a run",
+    "segslam.read_run('')": "empty text: give a path, `.` for this folder",
+    "segslam.map_folder('kitti', '')": "empty text: give a path, `.` for this folder",
     "segslam.read_run('x' * 5000)": f"{'x' * 80}...: File name too long; give another path",
     "segslam.map_folder('x' * 300, 'run')": f"{'x' * 80}...: File name too long; give another path",
     "segslam.evaluate(made, 'x' * 300)": f"{'x' * 80}...: File name too long; give another path",

@@ -92,11 +92,11 @@ class Terminal:
             print(text, flush=True)
 
     def progress(self, items: Iterable[Item], total: int, title: str, *, num_before: int = 0) -> Iterator[Item]:
-        """Yield the items; show a bar on a terminal, or print a line every ten seconds; no output if quiet.
+        """Yield the items; show a bar on a terminal, or print a line every ten seconds; no output if quiet or empty.
 
         `num_before`: number of first items that were finished in an earlier run; the rate is that of the others.
         """
-        if self.quiet:
+        if self.quiet or total == 0:
             yield from items
         elif sys.stderr.isatty():
             yield from _bar(items, total, title, num_before)

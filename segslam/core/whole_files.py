@@ -16,6 +16,8 @@ def expanded(path: str | Path) -> Path:
 
     Raises SegslamError for a user who does not exist, for a name that is too long, and for what is no path.
     """
+    if path == "":
+        raise SegslamError("empty text: give a path, `.` for this folder")
     try:
         whole = Path(path).expanduser()
     except RuntimeError as error:

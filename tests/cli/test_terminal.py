@@ -81,6 +81,12 @@ def test_every_command_works_in_a_terminal(tmp_path: Path, num_scans: int) -> No
             assert f"{num_scans}/{num_scans}" in text, text
 
 
+def test_there_is_no_bar_without_items(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    assert list(Terminal().progress(iter(()), total=0, title="refine 1/1")) == []
+    assert capsys.readouterr().err == ""
+
+
 def test_a_bar_passes_all_items_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     assert list(Terminal().progress(iter(range(3)), total=3, title="count")) == [0, 1, 2]

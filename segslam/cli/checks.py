@@ -94,8 +94,10 @@ def make_folder(
         settle(folder)  # puts back what a killed command had set aside
     if not overwrite or not folder.is_dir() or not any(folder.iterdir()):
         return new_folder(folder)
+    if folder.is_symlink():
+        raise SegslamError(f"{folder}: a link, which --overwrite does not replace; give {folder.resolve()} itself")
     logs = [file for name in made_by for file in folder.glob(name)]
-    if not logs or folder.is_symlink():
+    if not logs:
         raise SegslamError(f"{folder}: not made by this command, so --overwrite does not remove it; give another --out")
     for path in inputs:
         if path is not None and _holds(folder, path):

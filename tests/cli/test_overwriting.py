@@ -99,6 +99,9 @@ def test_only_a_finished_run_that_is_no_input_is_removed(made: Path, tmp_path: P
     (other / "me.jpg").touch()
     with pytest.raises(SegslamError, match="does not remove it"):
         make_folder(other, overwrite=True)
+    (tmp_path / "link").symlink_to(made)
+    with pytest.raises(SegslamError, match=f"link: a link, which --overwrite does not replace; give {made} itself"):
+        make_folder(tmp_path / "link", overwrite=True)
     with pytest.raises(SegslamError, match="contains the input"):
         make_folder(made, overwrite=True, inputs=[made / "log.mcap"])
     with pytest.raises(SegslamError, match="not empty"):

@@ -37,9 +37,11 @@ def check_run(run: Path) -> None:
 def check_free(files: Iterable[Path | None], *, overwrite: bool) -> None:
     """Raises SegslamError if one of the files to write exists, unless `overwrite` is set, or cannot be written.
 
-    A grid (.yaml) has two files.
+    Also for a file that is given twice. A grid (.yaml) has two files.
     """
     given = [file for file in files if file is not None]
+    if twice := [file for row, file in enumerate(given) if file in given[:row]]:
+        raise SegslamError(f"{twice[0]}: given twice; give each file once")
     for file in (*given, *(file.with_suffix(".pgm") for file in given if file.suffix.lower() == ".yaml")):
         check_target(file)
         if file.is_file() and not overwrite:

@@ -124,15 +124,17 @@ def sweep(
 
 
 def grid_of(settings: Sequence[str]) -> dict[str, list[str]]:
-    """Name -> settings of each combination. Raises SegslamError for a text without values."""
-    choices = []
+    """Name -> settings of each combination. Raises SegslamError for a text without values, and a key given twice."""
+    choices: dict[str, list[str]] = {}
     for text in settings:
         key, _, listed = text.partition("=")
         values = [value for value in listed.split(",") if value]
         if not key or not values:
             raise SegslamError(f"--set {text}: give values, as in --set verify.max_false_share=0.01,0.001")
-        choices.append([f"{key}={value}" for value in values])
-    return {" ".join(combination): list(combination) for combination in product(*choices)}
+        if key in choices:
+            raise SegslamError(f"--set {key}: given twice; give all its values at once, as in --set {key}=A,B")
+        choices[key] = [f"{key}={value}" for value in values]
+    return {" ".join(combination): list(combination) for combination in product(*choices.values())}
 
 
 def replay_one(log: str, folder: str, settings: list[str]) -> dict[str, Any]:

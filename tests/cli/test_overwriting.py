@@ -55,6 +55,15 @@ def test_a_file_is_replaced_only_if_wanted(
     assert file.read_bytes() != b"mine"
 
 
+def test_two_results_are_not_written_into_one_file(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "table"
+    assert run("eval", made, "--csv", file, "--latex", file) == 2
+    assert f"{file}: given twice; give each file once" in capsys.readouterr().err
+    assert not file.exists()
+
+
 def test_the_image_of_a_grid_is_not_replaced_either(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

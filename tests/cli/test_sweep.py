@@ -20,6 +20,8 @@ def test_all_combinations_are_made() -> None:
     for empty in ("a.b", "a.b=", "a.b=,"):
         with pytest.raises(SegslamError, match="give values"):
             grid_of([empty])
+    with pytest.raises(SegslamError, match=r"--set a\.b: given twice; give all its values at once"):
+        grid_of(["a.b=1", "c.d=x", "a.b=2"])
 
 
 @pytest.mark.long

@@ -115,7 +115,8 @@ def test_where_a_direction_is_badly_observed_little_free_space_may_be_violated()
 def test_a_sensor_has_room_and_something_to_see_along_the_whole_path(name: str) -> None:
     scene = SCENES[name](5)
     for row in range(0, len(scene.path), 12):
-        points = scan_points(scene, "16", pose(scene, row, np.random.default_rng(row)), noise_m=0.0, rng=np.random.default_rng(row))
+        rng = np.random.default_rng(row)
+        points = scan_points(scene, "16", pose(scene, row, rng), noise_m=0.0, rng=rng)
         ranges = np.linalg.norm(points, axis=1)
         assert len(points) > 3000, row
         assert ranges.min() > 0.5, row

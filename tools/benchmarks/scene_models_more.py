@@ -36,7 +36,9 @@ def mine(seed: int) -> Scene:
     )
     rows = slice(40, num_rings - 40, 2)
     return scene_of_parts(
-        [mesh(corners, triangles, Label.UNLABELLED)], path_along(*centre[rows].T, 1.5, heading[rows]), 6.0
+        [mesh(corners, triangles, Label.UNLABELLED)],
+        path_along(centre[rows, 0], centre[rows, 1], 1.5, heading[rows]),
+        6.0,
     )
 
 
@@ -71,8 +73,8 @@ def orchard(seed: int) -> Scene:
     for y in rows:
         for x in np.arange(0.0, size, 3.0):
             if rng.random() < 0.93:
-                at = np.array([x, y]) + rng.normal(scale=0.12, size=2)
-                parts.append(placed(tree(rng, scale=rng.uniform(0.4, 0.5)), *at, 0.0))
+                dx, dy = rng.normal(scale=0.12, size=2)
+                parts.append(placed(tree(rng, scale=rng.uniform(0.4, 0.5)), x + dx, y + dy, 0.0))
     along = np.arange(18.0, size - 18.0, 1.0)
     lanes = (rows[7] + 2.25, 0.0), (rows[11] + 2.25, np.pi)
     return scene_of_parts(

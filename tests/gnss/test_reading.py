@@ -279,7 +279,7 @@ def test_what_is_no_source_is_named(tmp_path: Path) -> None:
     with pytest.raises(SegslamError, match="a binary file"):
         read_fixes(tmp_path / "a.bin")
     (tmp_path / "a.mcap").write_bytes(b"no recording")
-    with pytest.raises(SegslamError, match=r"a\.mcap: its messages cannot be read"):
+    with pytest.raises(SegslamError, match=r"a\.mcap: cannot be opened as MCAP"):
         read_fixes(tmp_path / "a.mcap")
 
 

@@ -15,7 +15,7 @@ import typer
 
 from segslam.cli.commands import GroupedCommands, add
 from segslam.cli.console import FirstOfEachKind, say
-from segslam.core.errors import SegslamError, reason
+from segslam.core.errors import SegslamError, brief, reason
 from segslam.core.interrupts import EXIT_STATUS, ctrl_c_in_order, stop_line
 from segslam.core.memory import keep_freed_memory
 from segslam.core.whole_files import settle
@@ -112,9 +112,8 @@ def _of_file(error: OSError) -> str:
         return f"standard output: cannot be written ({reason(error)}); redirect it elsewhere"
     if isinstance(error, FileNotFoundError):
         return f"{error.filename or 'the present folder'}: no such file or folder; give a path that exists"
-    return (
-        f"{error.filename or 'output'}: cannot be read or written ({reason(error)}); check the path and its permissions"
-    )
+    name = brief(str(error.filename)) if error.errno == errno.ENAMETOOLONG else error.filename or "output"
+    return f"{name}: cannot be read or written ({reason(error)}); check the path and its permissions"
 
 
 def _flushed(status: int) -> int:

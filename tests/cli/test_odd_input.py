@@ -117,6 +117,7 @@ def test_a_name_that_is_too_long_is_refused_in_one_line(
         assert run(*(word.replace("LONG", name) for word in command)) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert line.endswith("(File name too long); check the path and its permissions")
+        assert len(line) < 200
 
 
 def test_a_present_folder_that_was_removed_is_named(

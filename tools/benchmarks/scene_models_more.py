@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
-from segslam.bench.simulation.mesh import Mesh, box, mesh, placed
+from segslam.bench.simulation.mesh import Mesh, band, box, mesh, placed
 from segslam.bench.simulation.objects import bush, tree
 from segslam.core.types import Label
 from tools.benchmarks.scene_parts import Scene, lifted, path_along, scene_of_parts, slab, uneven_ground, wall
@@ -26,14 +26,7 @@ def mine(seed: int) -> Scene:
     flat = centre[:, None] + (scale * sideways)[:, :, None] * across[:, None]
     height = np.where(upwards > 0.0, scale * upwards, 0.03 * rough / rough.std())
     corners = np.concatenate([flat, height[:, :, None]], axis=2).reshape(-1, 3)
-    ring, corner = (index.ravel() for index in np.meshgrid(range(num_rings - 1), range(num_corners), indexing="ij"))
-    here, after = ring * num_corners + corner, ring * num_corners + (corner + 1) % num_corners
-    triangles = np.concatenate(
-        [
-            np.column_stack([here, after, after + num_corners]),
-            np.column_stack([here, after + num_corners, here + num_corners]),
-        ]
-    )
+    triangles = np.concatenate([band(num_corners, num_corners) + num_corners * ring for ring in range(num_rings - 1)])
     rows = slice(40, num_rings - 40, 2)
     return scene_of_parts(
         [mesh(corners, triangles, Label.UNLABELLED)],
@@ -77,13 +70,12 @@ def orchard(seed: int) -> Scene:
                 parts.append(placed(tree(rng, scale=rng.uniform(0.4, 0.5)), x + dx, y + dy, 0.0))
     along = np.arange(18.0, size - 18.0, 1.0)
     lanes = (rows[7] + 2.25, 0.0), (rows[11] + 2.25, np.pi)
-    return scene_of_parts(
-        parts, np.concatenate([path_along(along, np.full_like(along, y), 1.6, yaw) for y, yaw in lanes]), 8.0
-    )
+    paths = [path_along(along, np.full_like(along, y), 1.6, yaw) for y, yaw in lanes]
+    return scene_of_parts(parts, np.concatenate(paths), 8.0)
 
 
 def yard(seed: int) -> Scene:
-    """A yard of 46 x 36 m between facades, around a lower building; windows, doors, trees and bushes."""
+    """A yard of 46 x 36 m between facades, around a lower building; pilasters, bays, trees, bushes and benches."""
     rng = np.random.default_rng(seed)
     parts = [slab(-2.0, 48.0, -2.0, 38.0, 0.0, Label.OTHER_GROUND)]
     parts += _facades([(0.0, 0.0), (46.0, 0.0), (46.0, 36.0), (0.0, 36.0)], 13.0, rng)
@@ -93,17 +85,9 @@ def yard(seed: int) -> Scene:
         side, share = int(rng.integers(4)), rng.uniform(0.05, 0.95)
         x, y = around[side] + share * (around[side + 1] - around[side]) + rng.choice([-3.0, 3.0], size=2)
         parts.append(placed(tree(rng, scale=0.7) if rng.random() < 0.5 else bush(rng, 1.6, 1.4), x, y, 0.0))
-    parts += [
-        box(
-            1.8,
-            0.5,
-            0.0,
-            rng.uniform(0.45, 1.2),
-            Label.UNLABELLED,
-            at=(rng.uniform(2.0, 44.0), rng.choice([1.0, 35.0])),
-        )
-        for _ in range(6)
-    ]
+    for _ in range(6):
+        height_m, at = rng.uniform(0.45, 1.2), (rng.uniform(2.0, 44.0), rng.choice([1.0, 35.0]))
+        parts.append(box(1.8, 0.5, 0.0, height_m, Label.UNLABELLED, at=at))
     rows = [
         np.array([*(start + share * (end - start)), 1.6, math.atan2(*(end - start)[::-1])])
         for start, end in pairwise(around)

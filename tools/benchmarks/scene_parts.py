@@ -24,15 +24,18 @@ class Scene:
 
 
 def scene_of_parts(parts: Sequence[Mesh], path: np.ndarray, max_shift_m: float) -> Scene:
+    """The scene that these parts make together; its fields as in `Scene`."""
     whole = join_meshes(parts)
     return Scene(whole, path, max_shift_m, scene_of(whole))
 
 
 def path_along(x: np.ndarray, y: np.ndarray, z: float, heading: np.ndarray | float) -> np.ndarray:
+    """Rows (n, 4) of a path at one height: positions (m) and headings (rad)."""
     return np.column_stack([x, y, np.full_like(x, z), np.broadcast_to(heading, x.shape)])
 
 
 def slab(x0: float, x1: float, y0: float, y1: float, z: float, label: Label = Label.BUILDING) -> Mesh:
+    """A level rectangle between two x and two y, at the height `z` (m)."""
     corners = np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
     return mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), label)
 
@@ -49,6 +52,7 @@ def wall(line: Sequence[tuple[float, float]], height_m: float) -> Mesh:
 
 
 def lifted(part: Mesh, z: float) -> Mesh:
+    """The part, `z` (m) higher."""
     return placed(part, 0.0, 0.0, z)
 
 

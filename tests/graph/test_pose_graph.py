@@ -533,6 +533,20 @@ def test_a_drive_in_a_map_has_the_breaks_and_the_travel_of_its_keyframes() -> No
     np.testing.assert_allclose(np.diff(graph.travel_m), [2.0, 2.0 + BREAK_LENGTH_M, 2.0])
 
 
+def test_between_keyframes_of_a_drive_in_a_map_the_covariances_are_those_of_its_motions() -> None:
+    alone, in_map = PoseGraph(CONFIG), AnchoredGraph(CONFIG)
+    for number, T_odom in enumerate(circle(6)):
+        information = np.diag([4.0, 5.0, 6.0, 1.0, 2.0, 3.0]) * (number + 1.0)
+        for graph in (alone, in_map):
+            graph.add_keyframe(number, T_odom, 2.0 * number, information=information)
+    known = true_closure(circle(6), 1, 0)
+    in_map.place(Placement(0, 7, np.eye(4), known.information, known.alignment, is_found=True))
+    alone.optimize()
+    in_map.optimize()
+    others = np.array([0, 2, 4])
+    np.testing.assert_allclose(in_map.covariances(5, others), alone.covariances(5, others), rtol=1e-6, atol=1e-12)
+
+
 def test_placements_in_a_map_have_the_weights_of_their_keyframes() -> None:
     graph = AnchoredGraph(CONFIG)
     for number in range(4):

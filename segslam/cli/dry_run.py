@@ -1,6 +1,5 @@
 """`segslam map --dry-run`: content of the data and effective settings; writes nothing."""
 
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from segslam.core.errors import BadScan, SegslamError, counted
@@ -74,10 +73,13 @@ def lines(found: dict[str, Any]) -> str:
 
 def first_usable(scans: "Dataset", *, backwards: bool = False) -> "tuple[int, Scan]":
     """Row and scan of the first usable scan, or of the last with `backwards`."""
+    why = ""
     for row in reversed(range(len(scans))) if backwards else range(len(scans)):
-        with suppress(BadScan):
+        try:
             return row, scans[row]
-    raise SegslamError(f"{scans.name}: none of its {len(scans)} scans can be read; check the files")
+        except BadScan as error:
+            why = why or str(error)
+    raise SegslamError(f"{scans.name}: none of {counted(len(scans), 'scan')} can be used; the first: {why}")
 
 
 def _labels(scans: "Dataset") -> str:

@@ -121,7 +121,7 @@ def locate(
             classes = None if labels == "geometric" else computed(ready.labels)
         except SegslamError as error:
             num_bad += 1
-            one = NOT_FOUND | {"reason": "unreadable", "detail": str(error).partition("; ")[0]}
+            one = NOT_FOUND | {"reason": "unreadable", "detail": str(error)}
         else:
             started = perf_counter()
             one = _place(locator.locate(ready.points, classes))
@@ -131,7 +131,7 @@ def locate(
     else:
         _show_places(scans, found, terminal)
     if num_bad:
-        raise SegslamError(f"{num_bad} of {len(scans)} scans cannot be read; copy the files again, or omit them")
+        raise SegslamError(f"{num_bad} of {len(scans)} scans cannot be read (reasons above); repair or omit them")
     if not any(one["found"] for one in found):
         raise typer.Exit(1)
 

@@ -109,6 +109,13 @@ def test_a_dry_run_shows_what_was_found_and_writes_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_dry_run_of_unusable_scans_gives_the_reason(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("0.bin", "1.bin"):
+        (tmp_path / name).write_bytes(bytes(17))
+    assert run("map", tmp_path, "--dry-run") == 2
+    assert "0.bin: 17 bytes are not a multiple of 16" in capsys.readouterr().err
+
+
 def test_without_a_folder_to_write_to_nothing_is_mapped(kitti: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("map", kitti) == 2
     assert "--out" in capsys.readouterr().err

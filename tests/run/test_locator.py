@@ -150,6 +150,7 @@ def test_poses_are_printed_though_another_scan_is_unreadable(
     assert out.startswith(f"{scan} ")
     assert len(out.split()) == 17
     assert "b.bin: not found: unreadable" in err
+    assert "b.bin: has no points; copy the file again" in err
     assert "1 of 2 scans cannot be read" in err
     assert "--frames" not in err
     assert commands.run("locate", run, bad, scan, "--json", "--quiet") == 2

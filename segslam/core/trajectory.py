@@ -27,6 +27,9 @@ LAYOUT: dict[PoseFormat, str] = {
     "tum": "TUM format has 8 numbers per line: seconds x y z qx qy qz qw",
 }
 ROTATION_TOLERANCE = 0.01  # chosen: above the rounding in files, far below the error of other matrices
+LARGEST = float(np.finfo(np.float32).max)
+"""Largest number of a pose or a graph: a point has no larger coordinates, and products of larger ones overflow."""
+NOT_FINITE = f"every number must be finite, at most {LARGEST:.2g}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +81,8 @@ def read_poses(path: Path, *, format: PoseFormat | None = None, skips_names: boo
     skips_names = skips_names or path.suffix.lower() == ".csv"
     if skips_names and len(lines) > 1 and not re.match(r"[-+.\d]", lines[0][1][0]):
         number, names = lines[0]
-        if any(name.lower().endswith("w") for name in names[4:-1]):
+        axes = "".join(name[-1] for name in map(str.lower, names[1:]) if name[-1] in "xyzw")
+        if not "xyzxyzw".startswith(axes):
             raise SegslamError(
                 f"{path}:{number}: its columns are {brief(' '.join(names))}; reorder them: {LAYOUT['tum']}"
             )
@@ -111,7 +115,7 @@ def as_poses(given: object, name: str) -> Poses:
         poses = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise SegslamError(f"{name}: {brief(str(given))} is no array; give finite matrices, (n, 4, 4)") from error
-    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not (np.abs(poses) <= LARGEST).all():
         raise SegslamError(f"{name}: poses of shape {poses.shape}; give finite matrices, (n, 4, 4)")
     off = np.abs(poses[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0)
     if len(poses) and max(off, _from_matrices(poses[:, :3])[1].max()) > ROTATION_TOLERANCE:
@@ -251,8 +255,8 @@ def _numbers(fields: list[str], format: PoseFormat) -> list[float]:
         values = [float(field) for field in fields]
     except ValueError as error:
         raise ValueError(f"{brief(str(error))}; {LAYOUT[format]}") from error
-    if not np.isfinite(values).all():
-        raise ValueError(f"{brief(' '.join(fields))}: every number must be finite")
+    if not all(abs(value) <= LARGEST for value in values):
+        raise ValueError(f"{brief(' '.join(fields))}: {NOT_FINITE}")
     return values
 
 

@@ -5,7 +5,6 @@ information, row by row. g2o puts translation before rotation, segslam after it:
 Like GTSAM, it uses the rotational part of the information as it is.
 """
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core.errors import brief
-from segslam.core.trajectory import ROTATION_TOLERANCE, from_quaternions
+from segslam.core.trajectory import LARGEST, NOT_FINITE, ROTATION_TOLERANCE, from_quaternions
 from segslam.core.types import Indices, SegslamError, Transform
 from segslam.core.whole_files import read_text
 from segslam.graph.edges import Edge, Transforms
@@ -121,8 +120,8 @@ def _read_tables(path: Path) -> tuple[_Table, _Table, _Table]:
             raise table.refusal(-1, brief(str(error))) from error
         if not 0 <= min(table.ids[-1]) <= max(table.ids[-1]) < 2**63:
             raise table.refusal(-1, "ids are at least 0 and below 2**63")
-        if not all(map(math.isfinite, table.numbers[-1])):
-            raise table.refusal(-1, "every number must be finite")
+        if not all(abs(number) <= LARGEST for number in table.numbers[-1]):
+            raise table.refusal(-1, NOT_FINITE)
     return tables[VERTEX], tables[EDGE], tables[FIX]
 
 

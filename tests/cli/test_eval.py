@@ -67,6 +67,13 @@ def test_rows_of_another_number_cannot_be_matched_but_stamps_can(
     assert "absolute trajectory error after alignment" in printed.out
 
 
+def test_a_pose_beyond_all_numbers_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    estimate, truth = _write_pair(tmp_path)
+    estimate.write_text("1 0 0 1e200 0 1 0 0 0 0 1 0\n" * 60)
+    assert _eval("--estimate", estimate, "--reference", truth, "--json") == 2
+    assert "estimate.txt:1: 1 0 0 1e200 0 1 0 0 0 0 1 0: every number must be finite" in capsys.readouterr().err
+
+
 def test_two_poses_are_too_few_to_be_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_kitti(tmp_path / "two.txt", np.tile(np.eye(4), (2, 1, 1)))
     assert _eval("--estimate", tmp_path / "two.txt", "--reference", tmp_path / "two.txt") == 2

@@ -87,6 +87,7 @@ def test_a_single_vertex_is_a_graph(tmp_path: Path) -> None:
         (1, f"VERTEX_SE3:QUAT {2**64} 1 0 0 0 0 0 1", "ids are at least 0 and below"),
         (1, "VERTEX_SE3:QUAT -1 1 0 0 0 0 0 1", "ids are at least 0 and below"),
         (1, "VERTEX_SE3:QUAT 1 nan 0 0 0 0 0 1", "every number must be finite"),
+        (1, "VERTEX_SE3:QUAT 1 1e200 0 0 0 0 0 1", "every number must be finite"),
         (1, "VERTEX_SE3:QUAT 1 1 0 0 0 0 0 0", "quaternion's length is off by 1"),
         (1, "VERTEX_SE3:QUAT 0 1 0 0 0 0 0 1", "vertex 0 is in line 1 already"),
         (1, "VERTEX_SE2 1 1 0 0", "graph in the plane; only graphs in space"),

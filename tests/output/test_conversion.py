@@ -76,6 +76,19 @@ def test_columns_in_another_order_are_refused(tmp_path: Path, capsys: pytest.Cap
     assert not (tmp_path / "a.tum").exists()
 
 
+@pytest.mark.parametrize("names", ["x,y,z,seconds,qx,qy,qz,qw", "seconds,y,x,z,qx,qy,qz,qw"])
+def test_any_other_order_of_the_columns_is_refused(tmp_path: Path, names: str) -> None:
+    (tmp_path / "a.csv").write_text(f"{names}\n0,0,0,0,0,0,0,1\n1,1,0,0,0,0,0,1\n")
+    with pytest.raises(SegslamError, match=r"a\.csv:1: its columns are .*; reorder them: TUM"):
+        read_poses(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize("names", ["seconds,x,y,z,qx,qy,qz,qw", "Time,Pos_X,Pos_Y,Pos_Z,q1,q2,q3,q4"])
+def test_other_names_of_the_same_columns_are_read(tmp_path: Path, names: str) -> None:
+    (tmp_path / "a.csv").write_text(f"{names}\n0,0,0,0,0,0,0,1\n1,1,0,0,0,0,0,1\n")
+    assert len(read_poses(tmp_path / "a.csv")) == 2
+
+
 def test_the_command_converts_and_does_not_replace(
     tum: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -11,6 +11,7 @@ from segslam.cli.checks import check_not_read, check_own, check_scans, make_fold
 from segslam.cli.console import Terminal
 from segslam.cli.options import EncodingOption, LabelsOption, Numbering, OverwriteOption, ScanOptions, Settings
 from segslam.core.errors import BadScan, SegslamError, counted
+from segslam.core.interrupts import same_command_with, when_stopped
 
 if TYPE_CHECKING:
     from segslam.scans import Dataset
@@ -61,6 +62,7 @@ def label(
             raise SegslamError(text) from error
     folder = make_folder(out.resolve(), overwrite=overwrite, made_by=("*.label",))
     tally = Tally(scans, true_scans, folder, write_as=write_as, num_pictures=pictures)
+    when_stopped(f"{out} has the labels of the scans so far; for all scans: {same_command_with('--overwrite')}")
     for row in terminal.progress(range(len(scans)), len(scans), "label"):
         tally.add(row)
     if not tally.seconds:

@@ -11,7 +11,7 @@ from helpers.commands import run
 from helpers.drives import write_kitti_sequence
 from helpers.made_networks import class_network
 
-from segslam.bench.labelling import STILL, class_scores, confusion, group_scores, largest_confusions
+from segslam.bench.labelling import STILL, Tally, class_scores, confusion, group_scores, largest_confusions
 from segslam.core.types import Label
 from segslam.labels.encodings import RAW_OF_LABEL, Encoding, of_classes, to_labels
 from segslam.labels.label_files import read_ids, read_labels
@@ -139,6 +139,23 @@ def test_bad_usage_is_reported(
 ) -> None:
     assert run("label", drive, "--out", tmp_path / "out", *options) == 2
     assert expected in capsys.readouterr().err
+
+
+def test_a_stopped_command_reports_the_labels_written_so_far(
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add_scan = Tally.add
+
+    def add(tally: Tally, row: int) -> None:
+        if row == 1:
+            raise KeyboardInterrupt
+        add_scan(tally, row)
+
+    monkeypatch.setattr(Tally, "add", add)
+    out = tmp_path / "out"
+    assert run("label", drive, "--labels", "geometric", "--out", out, "-q") == 130
+    assert [file.name for file in sorted(out.glob("*.label"))] == ["000000.label"]
+    assert f"stopped: {out} has the labels of the scans so far; for all scans: " in capsys.readouterr().err
 
 
 def test_existing_files_are_not_overwritten(drive: Path, tmp_path: Path) -> None:

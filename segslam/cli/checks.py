@@ -34,11 +34,12 @@ def check_run(run: Path) -> None:
     check_exists(run, "give a run folder, or its log.mcap")
 
 
-def check_free(files: Iterable[Path | None], *, overwrite: bool) -> None:
+def check_free(files: Iterable[Path | None], *, overwrite: bool, inputs: Iterable[Path | None] = ()) -> None:
     """Raises SegslamError if one of the files to write exists, unless `overwrite` is set, or cannot be written.
 
-    Also for a file that is given twice. A grid (.yaml) has two files.
+    Also for a file that is given twice, or that is one of the `inputs`. A grid (.yaml) has two files.
     """
+    read = {path.resolve() for path in inputs if path is not None}
     given = [file for file in files if file is not None]
     if twice := [file for row, file in enumerate(given) if file in given[:row]]:
         raise SegslamError(f"{twice[0]}: given twice; give each file once")
@@ -46,6 +47,8 @@ def check_free(files: Iterable[Path | None], *, overwrite: bool) -> None:
         check_target(file)
         if file.is_file() and not overwrite:
             raise SegslamError(f"{file}: exists; give another name, or replace it with --overwrite")
+        if file.resolve() in read:
+            raise SegslamError(f"{file}: is an input of this command; give another name")
 
 
 def outside(files: Iterable[Path], folder: Path) -> list[Path]:

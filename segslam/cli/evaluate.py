@@ -56,7 +56,7 @@ def evaluate(
     Example: segslam eval runs/00; or segslam eval --estimate poses_kitti.txt --reference kitti/poses/00.txt; or
     segslam eval --estimate runs --reference kitti/poses --csv kitti.csv
     """
-    check_free([plot, tables.csv, tables.latex], overwrite=overwrite)
+    check_free([plot, tables.csv, tables.latex], overwrite=overwrite, inputs=[estimate, reference])
     if plot is not None:
         from segslam.output.report.comparison import check_picture
 

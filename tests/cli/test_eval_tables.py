@@ -57,6 +57,18 @@ def test_two_folders_are_compared_drive_by_drive(
     assert "--overwrite" in capsys.readouterr().err
 
 
+def test_a_table_does_not_replace_the_poses_that_are_compared(
+    folders: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reference = tmp_path / "truth.csv"
+    (folders[1] / "00.txt").rename(reference)
+    poses = reference.read_text()
+    given = ["eval", "--estimate", folders[0] / "00.txt", "--reference", reference, "--csv", reference, "--overwrite"]
+    assert run(*given) == 2
+    assert "is an input of this command" in capsys.readouterr().err
+    assert reference.read_text() == poses
+
+
 def test_folders_without_a_common_drive_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("eval", "--estimate", tmp_path, "--reference", tmp_path, "-q") == 2
     assert "no drive has poses here and in" in capsys.readouterr().err

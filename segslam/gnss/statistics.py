@@ -25,6 +25,8 @@ CLIPPED_AT = 3.0
 """Chosen: residuals beyond this many standard deviations count as this many for the autocorrelation."""
 RUN_S = 15.0
 """Chosen: the weight of a fix is at most that of the median residual within this time before and after it."""
+NUM_FITTED = 3
+"""Heading and horizontal position of a drive."""
 KEPT_WEIGHT = 0.25
 """A fix is kept if its weight is that of a residual within three standard deviations, or more."""
 DRIFT = 0.02
@@ -41,8 +43,14 @@ def axis_sigma(residual_m: np.ndarray) -> float:
 
 
 def sigmas(residual: Points, used: Mask, used_up: Mask) -> Vector:
-    """(3,) robust standard deviations east, north and up of the used residuals; infinite up if none is used there."""
-    level = axis_sigma(residual[used] if used.any() else residual)
+    """(3,) robust standard deviations east, north and up of the used residuals; infinite up if none is used there.
+
+    Heading and position of the drive were fitted, so that few fixes have small residuals: the mean variance, given N
+    residuals of p fitted numbers, is N / (N - p - 2) times their mean square (inverse chi-square).
+    """
+    few = residual[used] if used.any() else residual
+    num = 2 * len(few)
+    level = axis_sigma(few) * np.sqrt(num / max(num - NUM_FITTED - 2, 1))
     return np.array([level, level, axis_sigma(residual[used_up, 2]) if used_up.any() else np.inf])
 
 

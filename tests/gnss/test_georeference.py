@@ -136,6 +136,23 @@ def test_a_heading_that_the_fixes_alone_do_not_determine_is_refused(step_m: floa
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("num", [4, 6])
+def test_the_error_of_the_heading_is_not_claimed_too_small_with_few_fixes(num: int) -> None:
+    """60 m of drive, 0.3 m of noise."""
+    times = np.arange(num) * round(5e9)
+    poses = np.stack([geometry.transform(np.eye(3), [60.0 * row / (num - 1), 0.0, 0.0]) for row in range(num)])
+    normal = []
+    for seed in range(150):
+        noise = 0.3 * np.random.default_rng(seed).standard_normal((num, 3))
+        places = geodetic_from_enu(poses[:, :3, 3] + noise, ORIGIN)
+        rows = [Row(int(stamp_ns), *at) for stamp_ns, at in zip(times, places, strict=True)]
+        found = place(prepare(make_fixes("few", rows), Drive(times, poses, np.arange(num))))
+        heading_rad = np.arctan2(found.T_enu_map[1, 0], found.T_enu_map[0, 0])
+        normal.append(np.degrees(heading_rad) / found.heading_sigma_deg)
+    assert 0.7 < np.sqrt(np.mean(np.square(normal))) < 1.5
+
+
+@pytest.mark.long
 @pytest.mark.parametrize(
     "longitude", [179.9999, *(pytest.param(one, marks=pytest.mark.slow) for one in (11.9999, -180.0))]
 )

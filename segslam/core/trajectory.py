@@ -81,7 +81,7 @@ def read_poses(path: Path, *, format: PoseFormat | None = None, skips_names: boo
     skips_names = skips_names or path.suffix.lower() == ".csv"
     if skips_names and len(lines) > 1 and not re.match(r"[-+.\d]", lines[0][1][0]):
         number, names = lines[0]
-        axes = "".join(name[-1] for name in map(str.lower, names[1:]) if name[-1] in "xyzw")
+        axes = "".join(name[-1] for name in map(str.lower, names[1:]) if name.endswith(tuple("xyzw")))
         if not "xyzxyzw".startswith(axes):
             raise SegslamError(
                 f"{path}:{number}: its columns are {brief(' '.join(names))}; reorder them: {LAYOUT['tum']}"

@@ -48,9 +48,9 @@ def sigmas(residual: Points, used: Mask, used_up: Mask) -> Vector:
     Heading and position of the drive were fitted, so that few fixes have small residuals: the mean variance, given N
     residuals of p fitted numbers, is N / (N - p - 2) times their mean square (inverse chi-square).
     """
-    few = residual[used] if used.any() else residual
-    num = 2 * len(few)
-    level = axis_sigma(few) * np.sqrt(num / max(num - NUM_FITTED - 2, 1))
+    chosen = residual[used] if used.any() else residual
+    num = 2 * len(chosen)
+    level = axis_sigma(chosen) * np.sqrt(num / max(num - NUM_FITTED - 2, 1))
     return np.array([level, level, axis_sigma(residual[used_up, 2]) if used_up.any() else np.inf])
 
 

@@ -83,7 +83,9 @@ def test_any_other_order_of_the_columns_is_refused(tmp_path: Path, names: str) -
         read_poses(tmp_path / "a.csv")
 
 
-@pytest.mark.parametrize("names", ["seconds,x,y,z,qx,qy,qz,qw", "Time,Pos_X,Pos_Y,Pos_Z,q1,q2,q3,q4"])
+@pytest.mark.parametrize(
+    "names", ["seconds,x,y,z,qx,qy,qz,qw", "seconds,x,y,z,qx,qy,qz,qw,", "Time,Pos_X,Pos_Y,Pos_Z,q1,q2,q3,q4"]
+)
 def test_other_names_of_the_same_columns_are_read(tmp_path: Path, names: str) -> None:
     (tmp_path / "a.csv").write_text(f"{names}\n0,0,0,0,0,0,0,1\n1,1,0,0,0,0,0,1\n")
     assert len(read_poses(tmp_path / "a.csv")) == 2

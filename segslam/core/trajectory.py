@@ -238,13 +238,18 @@ def nearest_rows(values: np.ndarray, targets: np.ndarray) -> Indices:
 def _number_lines(path: Path) -> list[tuple[int, list[str]]]:
     """(line number, fields) of each line with content."""
     text = read_text(path, "poses", "give a KITTI or TUM trajectory")
-    split = (
-        (number, re.split(r"[\s,]+", line.partition("#")[0].strip())) for number, line in enumerate(text.split("\n"), 1)
-    )
+    split = ((number, _fields(line.partition("#")[0])) for number, line in enumerate(text.split("\n"), 1))
     lines = [(number, fields) for number, fields in split if fields != [""]]
     if not lines:
         raise SegslamError(f"{path}: contains no pose; {LAYOUT['kitti']}, {LAYOUT['tum']}")
     return lines
+
+
+def _fields(line: str) -> list[str]:
+    """The fields of a line between blanks, commas, or semicolons; with semicolons, commas are decimal ones."""
+    if ";" in line:
+        line = line.replace(",", ".").replace(";", " ")
+    return re.split(r"[\s,]+", line.strip())
 
 
 def _numbers(fields: list[str], format: PoseFormat) -> list[float]:

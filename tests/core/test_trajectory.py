@@ -67,6 +67,14 @@ def test_comments_blank_lines_commas_and_a_byte_order_mark_are_read_over(tmp_pat
     np.testing.assert_allclose(read.T_a_b[:, :3, 3], [[1, 2, 3], [4, 5, 6]])
 
 
+def test_with_semicolons_commas_are_decimal_ones(tmp_path: Path) -> None:
+    text = "seconds;x;y;z;qx;qy;qz;qw\n1,5;1,25; 2;-3e0;0,0;0,0;0,0;1,0\n"
+    (tmp_path / "a.csv").write_text(text)
+    read = trajectory.read_poses(tmp_path / "a.csv")
+    assert read.stamp_ns is not None
+    assert (read.stamp_ns.tolist(), read.T_a_b[0, :3, 3].tolist()) == ([1_500_000_000], [1.25, 2.0, -3.0])
+
+
 def test_a_line_of_column_names_is_read_over_in_csv_alone(tmp_path: Path) -> None:
     text = "timestamp,x,y,z,qx,qy,qz,qw\n1.5,1,2,3,0,0,0,1\n"
     (tmp_path / "a.CSV").write_text(text)

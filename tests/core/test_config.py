@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from segslam.core.config import USER_SETTINGS, Config, config_from_yaml, config_to_yaml, load_config
+from segslam.core.config import USER_SETTINGS, Config, config_from_yaml, config_to_yaml, load_config, parse_yaml
 from segslam.core.types import Label, SegslamError
 
 
@@ -136,6 +136,10 @@ def test_yaml_that_is_no_settings_is_refused_in_one_short_line(tmp_path: Path, t
     assert str(refused.value).startswith(f"{file}: ")
     assert len(str(refused.value)) < len(str(file)) + 1000
     assert "\n" not in str(refused.value)
+
+
+def test_texts_of_digits_are_no_numbers_in_base_60_or_8() -> None:
+    assert parse_yaml("[10:30, 1:50:2, 010, 07, 7, -3, 0, 0x1f]", "a") == ["10:30", "1:50:2", "010", "07", 7, -3, 0, 31]
 
 
 @pytest.mark.parametrize("value", ["{[a]: b}", "0x_", "2001-99-99", "[" * 2000, "*a", "x" * 5000])

@@ -4,6 +4,7 @@ The YAML of files and of `--set` may be damaged or malicious.
 """
 
 import logging
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -97,6 +98,14 @@ class _Loader(yaml.SafeLoader):
                 raise yaml.constructor.ConstructorError(None, None, f"{key.value} is given twice", key.start_mark)
             seen.add(key.value)
         return super().construct_mapping(node, deep)
+
+
+def _integer(loader: _Loader, node: yaml.ScalarNode) -> int | str:
+    """The number, or the text itself where YAML 1.1 has base 60 or 8: the scans `10:30`, the sequence `010`."""
+    return node.value if re.search(r":|^[-+]?0\d", node.value) else loader.construct_yaml_int(node)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _integer)
 
 
 def parse_yaml(text: str, source: str) -> Any:

@@ -161,7 +161,7 @@ def _drive(value: Any, where: str, folder: Path) -> Drive:
 def _text(value: Any, where: str) -> str:
     """Texts and numbers, such as a sequence without quotes."""
     if isinstance(value, bool) or not isinstance(value, str | int):
-        raise SegslamError(f"{where}: expected a text, found {short(value)}")
+        raise SegslamError(f"{where}: expected a text, found {short(value)}; write it in quotes")
     return value if isinstance(value, str) else f"{value:02d}"
 
 

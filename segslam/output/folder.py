@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from segslam.core.errors import reason
+from segslam.core.errors import how_to_write, reason
 from segslam.core.trajectory import camera_from_lidar, read_poses, write_kitti, write_tum
 from segslam.core.types import (
     Alignment,
@@ -66,10 +66,9 @@ def check_new(folder: Path) -> None:
     """Raises SegslamError if the new folder of a run is not empty."""
     try:
         if folder.exists() and any(folder.iterdir()):
-            raise SegslamError(
-                f"{folder}: not empty; give another folder with --out, continue an interrupted run: segslam resume, or "
-                "replace a run: --overwrite"
-            )
+            resume = "continue an interrupted run: segslam resume, or replace a run"
+            more = resume if (folder / LOG).exists() else "or replace results of this command"
+            raise SegslamError(f"{folder}: not empty; give another folder with --out, {more}: --overwrite")
     except OSError as error:
         raise not_writable(folder, error) from error
 
@@ -176,10 +175,8 @@ def room_for(folder: Path) -> Iterator[None]:
         yield
     except (OSError, WorkFailed) as error:
         cause = error if isinstance(error, OSError) else error.__cause__
-        why = reason(cause) if isinstance(cause, OSError) else str(error)
-        raise WorkFailed(
-            f"{folder}: cannot write the results ({why}); free space on the disk; the log is complete"
-        ) from error
+        why = f"({reason(cause)}); {how_to_write(cause)}" if isinstance(cause, OSError) else f"({error})"
+        raise WorkFailed(f"{folder}: cannot write the results {why}; the log is complete") from error
 
 
 def _loop_cells(attempt: LoopAttempt, weights: dict[tuple[int, int], float]) -> dict[str, object]:

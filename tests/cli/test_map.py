@@ -91,7 +91,8 @@ def test_kiss_icp_alone_is_computed_only_to_be_compared_with_the_truth(
 def test_a_run_folder_is_never_overwritten(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "thesis.txt").write_text("results")
     assert run("map", kitti, "--out", tmp_path) == 2
-    assert "not empty; give another folder with --out, continue an interrupted run: segs" in capsys.readouterr().err
+    advice = "not empty; give another folder with --out, or replace results of this command: --overwrite"
+    assert advice in capsys.readouterr().err
     assert [file.name for file in tmp_path.iterdir()] == ["thesis.txt"]
 
 

@@ -2,6 +2,7 @@
 
 import shlex
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -113,6 +114,12 @@ def make_folder(
         raise SegslamError(f"{folder}: holds the present folder; change to another one, or give another --out")
     set_aside(folder)
     return new_folder(folder)
+
+
+def remove_if_empty(folder: Path) -> None:
+    """Remove the folder of a run that did not begin."""
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def check_links(folder: Path) -> None:

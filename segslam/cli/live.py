@@ -4,7 +4,7 @@ import json as json_text
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from segslam.cli.checks import check_exists, check_free, live_configs, make_folder, outside, show_preset
+from segslam.cli.checks import (
+    check_exists,
+    check_free,
+    live_configs,
+    make_folder,
+    outside,
+    remove_if_empty,
+    show_preset,
+)
 from segslam.cli.console import Terminal, how_to_go_on
 from segslam.cli.ending import finish
 from segslam.cli.options import GnssOptions, PresetOption, RunOutput
@@ -88,7 +96,7 @@ def live(
         scene = stack.enter_context(scene_in(None)) if output.view else None
         server = serve_foxglove(output.foxglove, stack, terminal)
         make_folder(out, overwrite=output.overwrite, inputs=[folder])
-        stack.callback(_remove_if_empty, out)
+        stack.callback(remove_if_empty, out)
         terminal.compile_kernels()
         go_on = f"make the results from the log: segslam replay {shlex.quote(str(out))} --out NEW"
         when_stopped("no scan was mapped, nothing was written")
@@ -130,12 +138,6 @@ def live(
             terminal.say(advice)
     if ended.failed:
         raise WorkFailed(f"{ended.why}; the scans until then are mapped, results in {out}")
-
-
-def _remove_if_empty(folder: Path) -> None:
-    """Remove the folder of a run that did not begin."""
-    with suppress(OSError):
-        folder.rmdir()
 
 
 def _follow(

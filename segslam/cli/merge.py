@@ -1,11 +1,12 @@
 """`segslam merge` and `fleet`: several drives in one frame."""
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from segslam.cli.checks import check_exists, check_own, make_folder
+from segslam.cli.checks import check_exists, check_own, make_folder, remove_if_empty
 from segslam.cli.console import Terminal
 from segslam.cli.ending import finish, is_interrupted
 from segslam.cli.options import WITH_MAP, RunSettings, Settings, WithMapOption
@@ -46,11 +47,13 @@ def merge(
     sessions = read_sessions(runs)
     terminal.compile_kernels()
     settings = changes.load(base=sessions[0].run.config)
-    merged = plan(sessions, config=settings, same_reference=same_reference, progress=terminal.progress)
-    terminal.say(merged.summary())
-    folder = make_folder(out, overwrite=changes.overwrite, inputs=runs)
-    when_stopped(f"the log in {folder} is kept, without results")
-    with merged.begun(folder, settings) as run:
+    with ExitStack() as stack:
+        folder = make_folder(out, overwrite=changes.overwrite, inputs=runs)
+        stack.callback(remove_if_empty, folder)
+        merged = plan(sessions, config=settings, same_reference=same_reference, progress=terminal.progress)
+        terminal.say(merged.summary())
+        when_stopped(f"the log in {folder} is kept, without results")
+        run = stack.enter_context(merged.begun(folder, settings))
         if is_interrupted(terminal.progress(run.take(merged.steps()), merged.num_steps, "merge")):
             raise typer.Exit(EXIT_STATUS)
         files = [folder / name for name in WITH_MAP] if with_map else []

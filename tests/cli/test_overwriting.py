@@ -145,6 +145,24 @@ def test_a_folder_with_other_content_is_not_written_into(
     assert [file.name for file in (tmp_path / "photos").iterdir()] == ["report.html"]
 
 
+def test_only_a_run_can_be_continued(made: Path, tmp_path: Path) -> None:
+    with pytest.raises(SegslamError, match=r"not empty; .*, continue an interrupted run: segslam resume, or replace"):
+        make_folder(made, overwrite=False)
+    (tmp_path / "000000.label").touch()
+    with pytest.raises(SegslamError, match=r"not empty; .*, or replace results of this command: --overwrite"):
+        make_folder(tmp_path, overwrite=False, made_by=("*.label",))
+
+
+def test_a_merged_run_cannot_replace_its_input_and_this_is_found_at_once(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("segslam.run.sessions.merge.plan", None)  # which registers the runs
+    other = make_run(tmp_path / "other").folder
+    assert run("merge", made, other, "--out", other, "--overwrite", "--quiet") == 2
+    assert f"{other}: contains the input {other}" in capsys.readouterr().err
+    assert (other / "log.mcap").exists()
+
+
 @pytest.mark.parametrize("is_made", [False, True])
 def test_a_run_that_a_killed_command_set_aside_is_back_at_the_next_start(tmp_path: Path, is_made: bool) -> None:
     out = make_run(tmp_path / "run").folder

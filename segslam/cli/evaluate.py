@@ -63,8 +63,9 @@ def evaluate(
         check_picture(plot)
     if run is not None or estimate is not None:
         terminal.announce(f"eval: reading {run or estimate}")
+    to_keep: dict[str, Any] = {}
     if run is not None and estimate is None:
-        figures = _score_run(run, reference, how, plot, terminal)
+        figures, to_keep = _score_run(run, reference, how, plot, terminal)
         rows = {run.resolve().name: figures}
     elif run is None and estimate is not None and reference is not None:
         if estimate.is_dir():
@@ -83,6 +84,7 @@ def evaluate(
         terminal.say(f"--rpe-distance {how.rpe_distance:g}: no drive is that long; the error over it is not given")
     tables.write(rows)
     from segslam.output.accuracy import AFTER
+    from segslam.output.folder import folder_of, write_metrics
     from segslam.output.words import FIGURES, SCORES
 
     meanings = {"ate_m": FIGURES["ate_m"]} | SCORES | FIGURES
@@ -90,14 +92,17 @@ def evaluate(
     terminal.table(figures, as_text(rows) if "drives" in figures else with_meanings([figures], meanings))
     if plot is not None and not terminal.json:
         terminal.say(f"figure written to {plot}")
+    if run is not None and to_keep:  # at the end: the figures are shown also if the folder cannot be written
+        write_metrics(folder_of(run), to_keep)
 
 
 def _score_run(
     folder: Path, reference_file: Path | None, how: Scoring, plot: Path | None, terminal: Terminal
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The figures, and those that metrics.json keeps."""
     from segslam.output.accuracy import accuracy, scores
     from segslam.output.finished import ACCURACY, plain_name, read_run, true_poses
-    from segslam.output.folder import folder_of, write_metrics
+    from segslam.output.folder import folder_of
     from segslam.run.evaluate import matched_poses
 
     if how.up == "-y":
@@ -124,13 +129,12 @@ def _score_run(
     metrics = {key: value for key, value in run.metrics.items() if plain_name(key) not in ACCURACY}
     metrics |= figures if how.align == "se3" else accuracy(run.result, reference, align=how.align)
     matched, truth = matched_poses(run.result.trajectory, reference)
-    if how.align == "se3":
-        write_metrics(folder, metrics)
     if plot is not None:
         from segslam.output.report.comparison import draw_scored
 
         draw_scored(plot, matched, truth, align=how.align)
-    return scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance) | metrics
+    figures = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance) | metrics
+    return figures, metrics if how.align == "se3" else {}
 
 
 def _score_folders(estimates: Path, references: Path, how: Scoring) -> dict[str, dict[str, Any]]:

@@ -44,6 +44,12 @@ def unreadable(path: object, content: str, error: Exception) -> str:
     return f"{path}: cannot read the {content} ({reason(error) if isinstance(error, OSError) else error})"
 
 
+def how_to_write(error: OSError) -> str:
+    """The remedy for a file that cannot be written: permission, or space."""
+    is_forbidden = error.errno in (errno.EROFS, errno.EACCES, errno.EPERM)
+    return "make it writable" if is_forbidden else "free space there"
+
+
 def reason(error: OSError) -> str:
     """Short reason of an error; NumPy's errors have no `strerror`, and give item counts if the disk is full."""
     if error.strerror is None and re.fullmatch(r"\d+ requested and \d+ written", str(error)):

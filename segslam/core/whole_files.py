@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from secrets import token_hex
 
-from segslam.core.errors import SegslamError, WorkFailed, brief, reason, unreadable
+from segslam.core.errors import SegslamError, WorkFailed, brief, how_to_write, reason, unreadable
 from segslam.core.interrupts import removed_when_stopped
 
 
@@ -137,4 +137,4 @@ def write_whole(file: Path, content: bytes | str) -> None:
 
 def cannot_write(file: Path, error: OSError) -> WorkFailed:
     """The exception for a file that cannot be written."""
-    return WorkFailed(f"{file}: cannot be written ({reason(error)}); free space there, or give another file")
+    return WorkFailed(f"{file}: cannot be written ({reason(error)}); {how_to_write(error)}, or give another file")

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.finished_run import METRICS, T_CAMERA_LIDAR, make_run
+from helpers.made_logs import largest_file
 
 from segslam import cli
 from segslam.core.evaluation import trajectory_metrics
@@ -132,6 +133,17 @@ def test_run_takes_the_new_figures_into_its_metrics(tmp_path: Path, capsys: pyte
     assert figures["num_loops_false"] == 1
     assert figures["loop_precision"] == 0.75
     assert figures["ate_m"] < 0.2 * figures["odometry_ate_m"]  # made so: the keyframes are true, the odometry drifts
+
+
+def test_a_run_that_cannot_be_written_is_scored_all_the_same(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = make_run(tmp_path / "run")
+    with largest_file(10):
+        assert _eval(made.folder, "--json") == 2
+    shown = capsys.readouterr()
+    assert json.loads(shown.out)["loop_precision"] == 0.75
+    assert "cannot write the results (File too large); free space there" in shown.err
 
 
 def test_run_is_scored_against_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
 """Outputs of every command on a full disk and over odd targets: one line, exit status 2, no half file."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -78,6 +79,8 @@ def test_a_file_appears_when_it_is_whole(tmp_path: Path) -> None:
     with pytest.raises(WorkFailed, match=r"out\.txt: cannot be written \(File too large\)"), largest_file(10):
         write_whole(file, 100 * "x")
     assert file.read_text() == "before"
+    with pytest.raises(WorkFailed, match=r"\(Read-only file system\); make it writable, or give"), whole_file(file):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
     with pytest.raises(ZeroDivisionError):
         _fail_midway(file)
     assert file.read_text() == "before"

@@ -202,9 +202,9 @@ def _edits(run: Path, forbid: list[str], add: list[str], *, add_near_fixes: bool
     if not forbidden | added:
         remedy = "the fixes propose no further loop" if add_near_fixes else "give --forbid I:J or --add I:J"
         raise SegslamError(f"nothing to edit: {remedy}")
-    from segslam.output.log import read_log
+    from segslam.run.replay import read_log_with_steps
 
-    edits, recorded = LoopEdits(forbidden, added), read_log(run)
+    edits, recorded = LoopEdits(forbidden, added), read_log_with_steps(run)
     if recorded.options.get("in_map"):
         raise SegslamError(f"{run}: localised in the map of another run, without loops of its own; edit that run")
     num = len(recorded.keyframes()[0])

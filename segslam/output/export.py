@@ -13,7 +13,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from segslam.core.config import MapConfig, load_config
-from segslam.core.types import GraphEstimate, Indices, Keyframe, Mask, SegslamError, Trajectory, Transform
+from segslam.core.types import Indices, Keyframe, Mask, SegslamError, Transform
 from segslam.core.whole_files import all_expanded, cannot_write, expanded, whole_file
 from segslam.output.finished import read_corrections
 from segslam.output.folder import PLACE_ON_GLOBE, read_localised
@@ -76,7 +76,7 @@ def write_maps(
             if file.name == BEFORE_AFTER:
                 complete.enter_context(whole_file(file)).write_bytes(draw_before_after(folder))
             elif is_track(file):
-                rows, stamp_ns = np.flatnonzero(_in_map(log)), _finished(log)[1].stamp_ns
+                rows, stamp_ns = np.flatnonzero(_in_map(log)), log.final()[1].stamp_ns
                 there = globe and replace(globe, T_enu_lidar=globe.T_enu_lidar[rows])
                 content = track(file, there, stamp_ns[rows], name=folder.resolve().name)
                 complete.enter_context(whole_file(file)).write_bytes(content)
@@ -89,18 +89,9 @@ def write_maps(
     return {**made, "map_seconds": perf_counter() - started}
 
 
-def _finished(log: RunLog) -> tuple[GraphEstimate, Trajectory]:
-    result = log.result()
-    if result is None:
-        raise SegslamError(
-            f"{log.path}: the run did not finish; run `segslam replay` on its log, or resume it with --resume"
-        )
-    return result
-
-
 def _placed(log: RunLog, globe: "Globe | None", show: Progress) -> Iterator[tuple[Keyframe, Transform]]:
     """Each keyframe of known pose, in the world or on the globe, its points corrected as in the adjustment."""
-    estimate, _ = _finished(log)
+    estimate, _ = log.final()
     in_map = _in_map(log)
     corrections = read_corrections(log, len(estimate.T_world_keyframe))
     num_gathered = 0
@@ -119,7 +110,7 @@ def _placed(log: RunLog, globe: "Globe | None", show: Progress) -> Iterator[tupl
 
 def _in_map(log: RunLog) -> Mask:
     """(n,) whether the pose of each scan is known: of a run localised in a map, where it is."""
-    num_scans = len(_finished(log)[1])
+    num_scans = len(log.final()[1])
     from_map_m = read_localised(log.path.parent, num_scans)
     return np.ones(num_scans, dtype=bool) if from_map_m is None else from_map_m <= TRUSTED_M
 

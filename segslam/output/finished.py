@@ -143,10 +143,7 @@ def _check_length(file: Path, num_poses: int, run: FinishedRun) -> None:
 
 
 def _result(log: RunLog) -> SlamResult:
-    final = log.result()
-    if final is None:
-        raise SegslamError(f"{log.path}: the run did not finish; `segslam replay` it, or map the data again")
-    estimate, trajectory = final
+    estimate, trajectory = log.final()
     T_odom_lidar, keyframe_rows = [], []
     attempts: list[LoopAttempt] = []
     motions: list[Motion] = []

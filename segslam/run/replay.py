@@ -58,8 +58,8 @@ class Replay:
     def of(
         cls, run: Path, *, config: Path | None = None, settings: Sequence[str] = (), edits: LoopEdits = NO_EDITS
     ) -> "Replay":
-        """Reads the log of a run, given its folder or the log. Raises SegslamError for a change without effect."""
-        recorded = read_log(run)
+        """Reads the log of a run, as `read_log_with_steps`. Raises SegslamError also for a change without effect."""
+        recorded = read_log_with_steps(run)
         changed = changed_config(recorded, file=config, settings=settings)
         return cls(recorded, changed, LoopEdits.from_json(recorded.options.get("edits", "")).and_then(edits))
 
@@ -88,6 +88,14 @@ class Replay:
             options=options,
             mirror=mirror,
         )
+
+
+def read_log_with_steps(run: Path) -> RunLog:
+    """The log of a run, given its folder or the log. Raises SegslamError also for a log without a step."""
+    recorded = read_log(run)
+    if recorded.num_steps() == 0:
+        raise SegslamError(f"{recorded.path}: has no complete step; continue it (segslam resume), or map again")
+    return recorded
 
 
 def changed_config(recorded: RunLog, *, file: Path | None = None, settings: Sequence[str] = ()) -> Config:

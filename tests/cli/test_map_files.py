@@ -97,7 +97,7 @@ def test_an_export_that_fails_writes_none_of_its_files(
 def test_an_unfinished_run_has_no_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cut = make_run(tmp_path / "cut", finished=False).folder
     assert run("export", cut, tmp_path / "map.ply") == 2
-    assert "did not finish" in capsys.readouterr().err
+    assert "did not finish; continue it (segslam resume), or replay its log" in capsys.readouterr().err
 
 
 @pytest.mark.long

@@ -8,6 +8,7 @@ import pytest
 import yaml
 from helpers.commands import run
 from helpers.drives import SLAM_CONFIG
+from helpers.made_logs import write_log
 
 from segslam.core.types import LoopAttempt, LoopClosure
 from segslam.output.finished import plain_name
@@ -88,6 +89,14 @@ def test_a_cut_log_is_replayed_up_to_the_cut(log: Path, tmp_path: Path) -> None:
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["num_scans"] == num_steps > 0
     assert "recorded_ate_m" not in metrics
+
+
+def test_a_log_without_a_step_is_refused_with_the_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = write_log(tmp_path / "log.mcap", [])
+    for command in (("replay", log), ("refine", log), ("edit", log, "--forbid", "1:0")):
+        assert run(*command, "--out", tmp_path / "run", "--quiet") == 2
+        assert "log.mcap: has no complete step; continue it (segslam resume), or map again" in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["log.mcap"]
 
 
 def test_a_file_that_is_not_a_log_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

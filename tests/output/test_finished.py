@@ -92,7 +92,7 @@ def test_folder_without_a_whole_run_is_refused(tmp_path: Path) -> None:
         read_run(tmp_path / "nowhere")
     with pytest.raises(SegslamError, match=r"log\.mcap"):
         read_run(tmp_path)
-    with pytest.raises(SegslamError, match="did not finish"):
+    with pytest.raises(SegslamError, match=r"did not finish; continue it \(segslam resume\), or replay its log$"):
         read_run(make_run(tmp_path / "killed", finished=False).folder)
     damaged = make_run(tmp_path / "damaged").folder
     content = bytearray((damaged / "log.mcap").read_bytes())

@@ -112,6 +112,12 @@ class RunLog:
             return None
         return self._decoded(_estimate, parts), self._decoded(_record, Trajectory, parts[schema.RESULT])
 
+    def final(self) -> tuple[GraphEstimate, Trajectory]:
+        """As `result`. Raises SegslamError if the run did not finish."""
+        if (result := self.result()) is None:
+            raise SegslamError(f"{self.path}: the run did not finish; continue it (segslam resume), or replay its log")
+        return result
+
     def late_loops(self) -> tuple[LoopAttempt, ...]:
         """Loops tried after the last scan; empty if the run did not finish."""
         late = self._ending().get(schema.LATE_LOOPS)
@@ -200,7 +206,7 @@ def read_log(run: Path) -> RunLog:
         raise SegslamError(f"{unreadable(path, 'log', error)}; {remedy}") from error
     check = metadata.get(schema.CHECK_METADATA)
     if cut is not None and check is None:
-        raise SegslamError(f"{path}: not a log of segslam, or truncated at its start; {remedy}") from cut
+        raise SegslamError(f"{path}: not a log of segslam, or truncated at its start; {remedy}, or map again") from cut
     if check is not None and check.get("crc32") != str(schema.checksum(metadata)):
         raise SegslamError(f"{path}: the settings at its start are damaged (wrong checksum); map the data again")
     about = restored(metadata.get(schema.RUN_METADATA, {}))

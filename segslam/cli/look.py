@@ -82,15 +82,17 @@ def report(run: Annotated[Path, "Run folder; report.html is written there."], *,
 
 def _found_in(log: "RunLog") -> dict[str, Any]:
     """Data, state, figures, options, changed settings and files (bytes) of a run."""
-    from segslam.core.config import Config, changed_settings
+    from segslam.core.config import changed_settings
     from segslam.output.finished import read_metrics
     from segslam.output.log import is_being_written
+    from segslam.scans.presets import defaults_in_effect
 
     folder = log.path.parent
     state = "in progress" if is_being_written(log.path) else "finished" if log.result() else "interrupted"
     metrics = read_metrics(folder) if (folder / "metrics.json").is_file() else {}
     if state == "finished" and metrics.get("num_scans_left"):
         state = "interrupted"
+    default = defaults_in_effect(log.config, log.T_camera_lidar)
     return {
         "run": str(folder),
         "data": log.run.get("dataset", ""),
@@ -98,7 +100,7 @@ def _found_in(log: "RunLog") -> dict[str, Any]:
         "num_steps": log.num_steps(),
         "figures": {key: metrics[key] for key in SHOWN if key in metrics},
         "options": {key: value for key, value in log.options.items() if value not in ("", "[]")},
-        "changed_settings": {key: str(now) for key, _, now in changed_settings(Config(), log.config)},
+        "changed_settings": {key: str(now) for key, _, now in changed_settings(default, log.config)},
         "files": {file.name: file.stat().st_size for file in sorted(folder.iterdir()) if file.is_file()},
     }
 
@@ -114,7 +116,8 @@ def _lines(found: dict[str, Any]) -> str:
     then = f"; continue with: segslam resume {shlex.quote(found['run'])}" if is_resumable else ""
     text = [f"{found['run']}: {found['data']}, {found['state']}, {num_steps} in the log{then}"]
     text += with_meanings([found["figures"]], {key: FIGURES[key] for key in found["figures"]}).splitlines()
-    for title, values in (("options", found["options"]), ("settings changed", found["changed_settings"])):
+    changed = found["changed_settings"]
+    for title, values in (("options", found["options"]), ("settings other than the defaults", changed)):
         text += [f"{title}: {'none' if not values else ''}".rstrip()]
         text += [f"  {key}={value}" for key, value in values.items()]
     text += ["files:", *(f"{_size(size):>10}  {name}" for name, size in found["files"].items())]

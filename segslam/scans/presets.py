@@ -7,8 +7,9 @@ import numpy as np
 
 from segslam.core.config import Config, load_config
 from segslam.core.points import voxel_first, within_range
-from segslam.core.types import BadScan, Points
+from segslam.core.types import BadScan, Points, Transform
 from segslam.scans import Dataset
+from segslam.scans.kitti import VERTICAL_ANGLE_DEG
 
 Preset = Literal["driving", "campus", "indoor"]
 SETTINGS = MappingProxyType[Preset, tuple[str, ...]](
@@ -41,6 +42,14 @@ SEQUENTIAL_SCANS = 80
 def preset(name: Preset) -> Config:
     """The defaults with the settings of a preset."""
     return load_config(None, SETTINGS[name])
+
+
+def defaults_in_effect(config: Config, T_camera_lidar: Transform | None) -> Config:
+    """The defaults that were in effect in a run with these settings; KITTI's data has a calibration."""
+    if config.sensor.vertical_angle_deg is None:  # not the settings in effect
+        return Config()
+    angle_deg = 0.0 if T_camera_lidar is None else VERTICAL_ANGLE_DEG
+    return load_config(None, [f"sensor.vertical_angle_deg={angle_deg}"])
 
 
 def preset_for(extent_m: float | None) -> Preset:

@@ -11,7 +11,7 @@ from helpers.drives import write_kitti_sequence
 from helpers.finished_run import make_run
 
 from segslam.cli.checks import is_finished
-from segslam.core.config import Config
+from segslam.core.config import Config, load_config
 from segslam.core.types import BadScan, Scan
 from segslam.output.log import LogWriter, read_log
 from segslam.scans import Dataset
@@ -175,3 +175,12 @@ def test_info_suggests_only_what_resume_accepts(
     is_tried = "found neither" in capsys.readouterr().err
     assert is_tried is (options.get("python") == "")
     assert ("segslam resume" in shown) is is_tried
+
+
+def test_the_angle_that_kittis_data_has_by_default_is_no_changed_setting(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = load_config(None, ["sensor.vertical_angle_deg=0.205", "map.color=height"])
+    LogWriter(tmp_path / "log.mcap", config=config, dataset="kitti/00", T_camera_lidar=np.eye(4)).close()
+    assert run("info", tmp_path, "--json", "--quiet") == 0
+    assert json.loads(capsys.readouterr().out)["changed_settings"] == {"map.color": "height"}

@@ -191,6 +191,16 @@ def test_changed_settings_are_marked_and_shown_open(tmp_path: Path) -> None:
         assert f"<summary>{section}</summary>" in changed
 
 
+def test_the_angle_in_effect_is_changed_where_it_is_not_that_of_the_data(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path / "run").folder)
+    for known, angle_deg, changed in ((True, 0.205, 0), (True, 0, 1), (False, 0, 0), (False, 0.205, 1)):
+        config = load_config(None, [f"sensor.vertical_angle_deg={angle_deg}"])
+        T_camera_lidar = run.T_camera_lidar if known else None
+        html = _page(replace(run, config=config, T_camera_lidar=T_camera_lidar), {})
+        assert html.count('<tr class="changed">') == changed
+        assert html.count(f"sensor.vertical_angle_deg={angle_deg:.3g}") == changed
+
+
 def test_names_are_not_taken_for_markup(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path / "run").folder)
     assert "<script>" not in _page(replace(run, dataset="<script>alert(1)</script>"), {"<script>": "<svg/>"})
@@ -280,7 +290,7 @@ def test_conditions_name_when_where_and_how_the_run_was_made(tmp_path: Path, mon
     assert conditions["command"] == "segslam map my_drive"
     assert "cores" in conditions["processor"]
     assert conditions["settings other than the defaults"] == "none"
-    assert settings_not_default(load_config(None, ["map.color=height"])) == "map.color=height"
+    assert settings_not_default(load_config(None, ["map.color=height"]), Config()) == "map.color=height"
 
 
 def test_the_gallery_has_the_best_accepted_and_the_nearest_missed_loops(tmp_path: Path) -> None:

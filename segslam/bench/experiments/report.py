@@ -131,7 +131,7 @@ def _page(report: dict[str, Any], plots: Mapping[str, str], pictures: Mapping[st
     boxes += [section(one.caption, html(one)) for one in tables(report)]
     columns = [picture_section(caption, svg) for caption, svg in plots.items()]
     columns += [picture_section(caption, png) for caption, png in pictures.items()]
-    settings = settings_tables(Config.model_validate(report["settings"]))
+    settings = settings_tables(Config.model_validate(report["settings"]), Config())
     return document(
         _title(report),
         f'{"".join(boxes)}<div class="plots">{"".join(columns)}</div>'
@@ -142,7 +142,7 @@ def _page(report: dict[str, Any], plots: Mapping[str, str], pictures: Mapping[st
 def _facts(report: dict[str, Any]) -> dict[str, Any]:
     """Conditions of the benchmark, except the settings."""
     machine = report["machine"]
-    simulation = report["simulation"]
+    simulation, settings = report["simulation"], Config.model_validate(report["settings"])
     return {
         "machine": f"{machine['cpu']}, {machine['cores']} cores, {machine['system']}, Python {machine['python']}",
         "load over 15 minutes": machine["load"],
@@ -152,5 +152,5 @@ def _facts(report: dict[str, Any]) -> dict[str, Any]:
         "labels": report["labels"],
         "pairs": ", ".join(f"{one['name']}: {one['pairs']} of {one['of']}" for one in report["lists"]),
         "options": ", ".join(f"{name} {value}" for name, value in report["options"].items() if value is not None),
-        "settings other than the defaults": settings_not_default(Config.model_validate(report["settings"])) or "none",
+        "settings other than the defaults": settings_not_default(settings, Config()) or "none",
     }

@@ -12,6 +12,7 @@ from segslam.core.errors import counted, noun
 from segslam.core.types import Rejected
 from segslam.output.finished import COMPARED, FinishedRun, plain_name
 from segslam.output.words import CONDITIONS, FIGURES, FILES, REASONS, WORDS
+from segslam.scans.presets import defaults_in_effect
 from segslam.slam.adjustment.vertical_angle import vertical_angle_advice
 
 
@@ -29,7 +30,7 @@ def page(run: FinishedRun, plots: Mapping[str, str], *, top: str, gallery: str, 
         title,
         f'<div class="soft">segslam run <code>{escape(name)}</code></div>\n'
         f'<div class="tiles">{_tiles(run.metrics)}</div>\n{top}<div class="plots">{"".join(sections)}</div>\n'
-        f"{gallery}{section('Settings', settings_tables(run.config))}",
+        f"{gallery}{section('Settings', settings_tables(run.config, _defaults(run)))}",
     )
 
 
@@ -49,13 +50,17 @@ def _files(run: FinishedRun) -> str:
 
 def _conditions(run: FinishedRun, about: Mapping[str, str]) -> str:
     facts = {name: about[key] for key, name in CONDITIONS.items() if key in about}
-    facts["settings other than the defaults"] = settings_not_default(run.config) or "none"
+    facts["settings other than the defaults"] = settings_not_default(run.config, _defaults(run)) or "none"
     return table((escape(name), escape(value)) for name, value in facts.items())
 
 
-def settings_not_default(config: Config) -> str:
+def _defaults(run: FinishedRun) -> Config:
+    return defaults_in_effect(run.config, run.T_camera_lidar)
+
+
+def settings_not_default(config: Config, default: Config) -> str:
     """The settings that differ from the defaults, in the format of `--set`."""
-    return ", ".join(f"{key}={value}" for key, _, value in changed_settings(Config(), config))
+    return ", ".join(f"{key}={value}" for key, _, value in changed_settings(default, config))
 
 
 def document(title: str, body: str) -> str:
@@ -128,9 +133,8 @@ def _outcomes(run: FinishedRun) -> str:
     return table(rows, head=("", "attempts")) + words
 
 
-def settings_tables(config: Config) -> str:
+def settings_tables(config: Config, default: Config) -> str:
     """All settings by section. Changed settings are marked; their sections come first and are open."""
-    default = Config()
     tables = ""
     for name in sorted(Config.model_fields, key=lambda name: getattr(config, name) == getattr(default, name)):
         values, usual = (getattr(one, name).model_dump(mode="json") for one in (config, default))

@@ -206,6 +206,14 @@ def test_a_session_in_another_town_is_refused_and_nothing_is_left(
     assert not (tmp_path / "both").exists()
 
 
+def test_a_session_that_shares_too_short_a_way_is_refused_with_this_reason(days: Days, tmp_path: Path) -> None:
+    scans = write_day(tmp_path / "scans", day=1, first=6, num_scans=4)
+    dense = load_config(None, ["keyframes.distance_m=1"], base=UNADJUSTED)
+    short = segslam.map_folder(scans, tmp_path / "short", config=dense)
+    with pytest.raises(segslam.SegslamError, match=r"were found there, but all within 10 m of its drive: too short"):
+        segslam.merge([days.monday.folder, short.folder], tmp_path / "both")
+
+
 def test_a_new_day_is_localised_in_the_old_map_which_is_only_read(
     days: Days, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -77,8 +77,10 @@ def find_session(
             break
     if not _is_enough(kept, session):
         why = f"{MIN_CONSISTENT} are needed"
-        if len(found) >= MIN_CONSISTENT:
-            why = f"but no {MIN_CONSISTENT} of them, {OTHER_PLACE_M:g} m apart, are consistent with the odometry"
+        if len(kept) >= MIN_CONSISTENT:
+            why = f"but all within {OTHER_PLACE_M:g} m of its drive: too short a way is shared"
+        elif len(found) >= MIN_CONSISTENT:
+            why = f"but no {MIN_CONSISTENT} of them are consistent with the odometry"
         return Relation(None, (), f"{len(found)} of {num_tried} keyframes were found there, {why}")
     for one in kept:
         graph.add_closure(shifted(one, first_id, 0))

@@ -1,10 +1,11 @@
 """A finished run, written to files: its map, and its trajectory and origin on the globe (GeoJSON, KML, GPX, YAML)."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from segslam.core.config import MapConfig, load_config
-from segslam.core.types import Indices, Keyframe, Mask, SegslamError, Transform
+from segslam.core.types import Indices, Keyframe, Mask, MotionState, SegslamError, Transform
 from segslam.core.whole_files import all_expanded, cannot_write, expanded, whole_file
 from segslam.output.finished import read_corrections
 from segslam.output.folder import PLACE_ON_GLOBE, read_localised
@@ -78,7 +79,8 @@ def write_maps(
             elif is_track(file):
                 rows, stamp_ns = np.flatnonzero(_in_map(log)), log.final()[1].stamp_ns
                 there = globe and replace(globe, T_enu_lidar=globe.T_enu_lidar[rows])
-                content = track(file, there, stamp_ns[rows], name=folder.resolve().name)
+                name, cuts = folder.resolve().name, _cuts(log, rows)
+                content = track(file, there, stamp_ns[rows], name=name, cuts=cuts)
                 complete.enter_context(whole_file(file)).write_bytes(content)
         if not of_map:
             return {"map_seconds": perf_counter() - started}
@@ -115,16 +117,24 @@ def _in_map(log: RunLog) -> Mask:
     return np.ones(num_scans, dtype=bool) if from_map_m is None else from_map_m <= TRUSTED_M
 
 
+def _cuts(log: RunLog, rows: Indices) -> list[int]:
+    """The places among the scans `rows` where another drive of a merged run begins, or scans are missing."""
+    steps = enumerate(log.steps(clouds=False))
+    begun = [row for row, step in steps if step.motion is not None and step.motion.state is MotionState.BEGUN]
+    cuts: list[int] = (np.flatnonzero((np.diff(rows) > 1) | np.isin(rows[1:], begun)) + 1).tolist()
+    return cuts
+
+
 def is_track(file: Path) -> bool:
     """True for a file that this module writes."""
     return file.suffix.lower() in KINDS or file.name == PROJECTOR_INFO
 
 
-def track(file: Path, globe: "Globe | None", stamp_ns: Indices, *, name: str) -> bytes:
+def track(file: Path, globe: "Globe | None", stamp_ns: Indices, *, name: str, cuts: Sequence[int] = ()) -> bytes:
     """The content of a file with the trajectory of a run, by the extension of its name.
 
-    `stamp_ns` (n,): times of the scans, which GPX has if they are later than the year 2000; `name` of the track. Raises
-    SegslamError if the run was not georeferenced.
+    `stamp_ns` (n,): times of the scans, which GPX has if they are later than the year 2000; `name` of the track; it has
+    a gap before each of the scans `cuts`. Raises SegslamError if the run was not georeferenced.
     """
     if globe is None:
         raise SegslamError(f"{file}: the run has no place on the globe; `segslam georeference RUN --gnss FIXES` first")
@@ -137,39 +147,48 @@ def track(file: Path, globe: "Globe | None", stamp_ns: Indices, *, name: str) ->
         [round(longitude, DEGREES), round(latitude, DEGREES), round(height_m, METRES)]
         for latitude, longitude, height_m in places.tolist()
     ]
-    return KINDS[file.suffix.lower()](rows, stamp_ns, name)
+    return KINDS[file.suffix.lower()](rows, stamp_ns, name, cuts)
 
 
-def _geojson(rows: Rows, stamp_ns: Indices, name: str) -> bytes:
+def _parts(rows: Rows, cuts: Iterable[int]) -> list[Rows]:
+    """The parts between the cuts, of two rows at least: a line has two ends."""
+    parts = [rows[a:b] for a, b in pairwise([0, *sorted(cuts), len(rows)])]
+    return [part if len(part) > 1 else 2 * part for part in parts]
+
+
+def _geojson(rows: Rows, stamp_ns: Indices, name: str, cuts: Sequence[int]) -> bytes:
     """RFC 7946: WGS84, longitude first. A track across the date line is cut into parts there (section 3.1.9)."""
-    cuts = (np.flatnonzero(np.abs(np.diff([row[0] for row in rows])) > 180.0) + 1).tolist()
-    parts = [rows[a:b] for a, b in zip([0, *cuts], [*cuts, len(rows)], strict=True)]
-    parts = [part if len(part) > 1 else 2 * part for part in parts]
+    over = (np.flatnonzero(np.abs(np.diff([row[0] for row in rows])) > 180.0) + 1).tolist()
+    parts = _parts(rows, {*cuts, *over})
     line = {"type": "LineString", "coordinates": parts[0]}
     geometry = line if len(parts) == 1 else {"type": "MultiLineString", "coordinates": parts}
     feature = {"type": "Feature", "properties": {"name": name}, "geometry": geometry}
     return (json.dumps({"type": "FeatureCollection", "features": [feature]}) + "\n").encode()
 
 
-def _kml(rows: Rows, stamp_ns: Indices, name: str) -> bytes:
+def _kml(rows: Rows, stamp_ns: Indices, name: str, cuts: Sequence[int]) -> bytes:
     """OGC KML 2.2; heights are above the ellipsoid, so viewers draw the track on the ground."""
     root = Xml.Element("kml", xmlns=KML)
     placemark = Xml.SubElement(Xml.SubElement(root, "Document"), "Placemark")
     Xml.SubElement(placemark, "name").text = name
-    line = Xml.SubElement(placemark, "LineString")
-    Xml.SubElement(line, "altitudeMode").text = "clampToGround"
-    Xml.SubElement(line, "coordinates").text = " ".join(",".join(map(str, row)) for row in rows)
+    lines = Xml.SubElement(placemark, "MultiGeometry") if cuts else placemark
+    for part in _parts(rows, cuts):
+        line = Xml.SubElement(lines, "LineString")
+        Xml.SubElement(line, "altitudeMode").text = "clampToGround"
+        Xml.SubElement(line, "coordinates").text = " ".join(",".join(map(str, row)) for row in part)
     return _xml(root)
 
 
-def _gpx(rows: Rows, stamp_ns: Indices, name: str) -> bytes:
+def _gpx(rows: Rows, stamp_ns: Indices, name: str, cuts: Sequence[int]) -> bytes:
     """GPX 1.1."""
     root = Xml.Element("gpx", xmlns=GPX, version="1.1", creator="segslam")
     made = Xml.SubElement(root, "trk")
     Xml.SubElement(made, "name").text = name
     segment = Xml.SubElement(made, "trkseg")
     since_2000 = datetime(2000, 1, 1, tzinfo=UTC).timestamp()
-    for (longitude, latitude, height_m), stamp in zip(rows, stamp_ns, strict=True):
+    for number, ((longitude, latitude, height_m), stamp) in enumerate(zip(rows, stamp_ns, strict=True)):
+        if number in cuts:
+            segment = Xml.SubElement(made, "trkseg")
         point = Xml.SubElement(segment, "trkpt", lat=str(latitude), lon=str(longitude))
         Xml.SubElement(point, "ele").text = str(height_m)
         if stamp > 1e9 * since_2000:
@@ -193,5 +212,9 @@ def _projector_info(origin: "Origin") -> bytes:
     ).encode()
 
 
-KINDS: dict[str, Callable[[Rows, Indices, str], bytes]] = {".geojson": _geojson, ".kml": _kml, ".gpx": _gpx}
+KINDS: dict[str, Callable[[Rows, Indices, str, Sequence[int]], bytes]] = {
+    ".geojson": _geojson,
+    ".kml": _kml,
+    ".gpx": _gpx,
+}
 """Writers by file extension."""

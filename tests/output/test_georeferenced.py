@@ -208,6 +208,19 @@ def test_a_track_across_the_date_line_is_cut_there(tmp_path: Path) -> None:
     np.testing.assert_allclose(enu_from_geodetic(opened[:, [1, 0, 2]], globe.origin)[:, 0], east_m, atol=0.001)
 
 
+def test_a_track_has_no_line_between_two_drives(tmp_path: Path) -> None:
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, 0, 3] = 10.0 * np.arange(6)
+    files = [tmp_path / name for name in ("track.geojson", "track.kml", "track.gpx")]
+    for file in files:
+        file.write_bytes(track(file, Globe(Origin(17.0, 8.0, 5.0), poses), np.arange(6), name="a", cuts=[2, 5]))
+    parts = json.loads(files[0].read_text())["features"][0]["geometry"]["coordinates"]
+    assert [len(part) for part in parts] == [2, 3, 2], "a line has two ends, also of one scan"
+    lines = Xml.parse(files[1]).findall(f".//{KML}MultiGeometry/{KML}LineString/{KML}coordinates")
+    assert [len((line.text or "").split()) for line in lines] == [2, 3, 2]
+    assert [len(segment) for segment in Xml.parse(files[2]).findall(f".//{GPX}trkseg")] == [2, 3, 1]
+
+
 def test_a_pixel_of_the_geotiff_is_where_the_point_is() -> None:
     """Up to the edge of a UTM zone, 500 m from the origin."""
     for longitude in (8.39, 11.9999, 179.9999):

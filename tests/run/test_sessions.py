@@ -142,6 +142,9 @@ def test_a_merged_run_is_placed_by_the_fixes_of_all_sessions(
     assert values["num_fixes_kept"] > 0.9 * values["num_fixes"]
     assert made.reference is not None
     assert _off_globe_m(made.folder, made.reference).max() < 0.4
+    segslam.export(made.folder, tmp_path / "track.geojson")
+    parts = json.loads((tmp_path / "track.geojson").read_text())["features"][0]["geometry"]["coordinates"]
+    assert [len(part) for part in parts] == [22, 22]
 
 
 @pytest.mark.slow

@@ -73,7 +73,7 @@ def _ranked_plans(source: PreparedScan, target: PreparedScan) -> Iterator[Regist
 
 @lru_cache(NUM_FLOOR_PLANS)
 def _floor_plan(scan: PreparedScan) -> segregator.FloorPlan:
-    return segregator.FloorPlan(scan.surface.standing()[0], segregator.vertical(scan.description))
+    return segregator.FloorPlan(*scan.surface.standing(), segregator.vertical(scan.description))
 
 
 @lru_cache(NUM_FEW)

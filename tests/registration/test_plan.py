@@ -7,40 +7,75 @@ import pytest
 
 from segslam.core import geometry
 from segslam.core.config import load_config
-from segslam.core.types import Alignment, Label, Points, Registration, Transform
-from segslam.registration.segregator.plan import CELL_M, HALF, MAX_COUNT, NUM_YAWS, FloorPlan, _plans, plan_hypotheses
+from segslam.core.types import Alignment, Direction, Label, Points, Registration, Transform
+from segslam.registration.segregator.plan import (
+    CELL_M,
+    HALF,
+    MAX_COUNT,
+    NUM_YAWS,
+    SAME_CELLS,
+    FloorPlan,
+    plan_hypotheses,
+)
 from segslam.verification import register
 
 UP = np.array([0.0, 0.0, 1.0])
 HALF_STEP_RAD = math.pi / NUM_YAWS
 
 
-def _court(points_per_metre: int = 8) -> Points:
-    """Walls of a court of 18 x 26 m with a recess, of different heights; the sensor stands in a corner of it."""
+COURT = (
+    ((-4, -6), (14, -6), 3.0),
+    ((14, -6), (14, 8), 6.0),
+    ((14, 8), (9, 8), 6.0),
+    ((9, 8), (9, 20), 4.0),
+    ((9, 20), (-4, 20), 2.5),
+    ((-4, 20), (-4, -6), 5.0),
+)
+"""Ends and height of each wall of a court of 18 x 26 m with a recess; the sensor stands in a corner of it."""
+Walls = tuple[Points, Points]
+"""Points, and their normals."""
+
+
+def _walls(
+    ends: tuple[tuple[tuple[float, float], tuple[float, float], float], ...], points_per_metre: int = 8
+) -> Walls:
     rng = np.random.default_rng(0)
-    parts = []
-    for (x0, y0), (x1, y1), top_m in (
-        ((-4, -6), (14, -6), 3.0),
-        ((14, -6), (14, 8), 6.0),
-        ((14, 8), (9, 8), 6.0),
-        ((9, 8), (9, 20), 4.0),
-        ((9, 20), (-4, 20), 2.5),
-        ((-4, 20), (-4, -6), 5.0),
-    ):
-        along = rng.uniform(0, 1, int(points_per_metre * math.hypot(x1 - x0, y1 - y0)))
-        parts.append(
+    points, normals = [], []
+    for (x0, y0), (x1, y1), top_m in ends:
+        length_m = math.hypot(x1 - x0, y1 - y0)
+        along = rng.uniform(0, 1, int(points_per_metre * length_m))
+        points.append(
             np.column_stack([x0 + along * (x1 - x0), y0 + along * (y1 - y0), rng.uniform(-1.5, top_m, len(along))])
         )
-    return np.concatenate(parts)
+        normals.append(np.tile([(y0 - y1) / length_m, (x1 - x0) / length_m, 0.0], (len(along), 1)))
+    return np.concatenate(points), np.concatenate(normals)
 
 
-def test_a_cell_counts_its_points_up_to_a_limit() -> None:
+def _court() -> Walls:
+    return _walls(COURT)
+
+
+def _seen_from(T_here: Transform, walls: Walls) -> Walls:
+    """The walls in another frame."""
+    R = T_here[:3, :3].T
+    return geometry.apply(geometry.inverse(T_here), walls[0]), walls[1] @ R.T
+
+
+def _plan(walls: Walls, up: Direction = UP) -> FloorPlan:
+    return FloorPlan(*walls, up)
+
+
+def test_a_cell_counts_its_points_up_to_a_limit_and_sums_directions_of_their_normals() -> None:
     in_one, in_another = np.full((3, 3), 0.1), np.full((2 * MAX_COUNT, 3), 5.1)
-    [plan] = _plans(np.concatenate([in_one, in_another]), np.zeros(1))
-    expected = np.zeros_like(plan)
-    expected[HALF, HALF] = 3
-    expected[HALF + int(5.1 / CELL_M), HALF + int(5.1 / CELL_M)] = MAX_COUNT
-    np.testing.assert_array_equal(plan, expected)
+    normals = np.repeat([[1.0, 0.0, 0.0], [math.sqrt(0.5), math.sqrt(0.5), 0.0]], [3, 2 * MAX_COUNT], axis=0)
+    plan = FloorPlan(np.concatenate([in_one, in_another]), normals, UP)
+    expected = np.zeros((3, *plan.at(np.zeros(1)).shape[2:]))
+    there = HALF + int(5.1 / CELL_M)
+    expected[:, HALF, HALF] = 3.0, 3.0, 0.0
+    expected[:, there, there] = MAX_COUNT, 0.0, MAX_COUNT
+    np.testing.assert_allclose(plan.at(np.zeros(1))[:, 0], expected, atol=1e-5)
+    turned = plan.at(np.array([math.pi / 2.0]))[:, 0]  # a wall seen from the other side is the same wall
+    np.testing.assert_allclose(turned[:, HALF - 1, HALF], [3.0, -3.0, 0.0], atol=1e-5)
 
 
 def _error(found: Registration, T_target_source: Transform) -> tuple[float, float]:
@@ -51,13 +86,13 @@ def _error(found: Registration, T_target_source: Transform) -> tuple[float, floa
 @pytest.mark.parametrize("yaw_deg", range(0, 360, 37))
 def test_a_court_is_found_again_from_elsewhere_at_any_yaw(yaw_deg: int) -> None:
     T_target_source = geometry.transform(geometry.yaw(math.radians(yaw_deg)), np.array([7.0, 9.0, 1.2]))
-    source = geometry.apply(geometry.inverse(T_target_source), _court())
-    (found,) = plan_hypotheses(FloorPlan(source, UP), FloorPlan(_court(), UP), num_poses=1)
+    source = _seen_from(T_target_source, _court())
+    (found,) = plan_hypotheses(_plan(source), _plan(_court()), num_poses=1)
     apart_m, apart_rad = _error(found, T_target_source)
-    reach_m = np.linalg.norm(source, axis=1).max()
+    reach_m = np.linalg.norm(source[0], axis=1).max()
     assert apart_rad <= HALF_STEP_RAD + 1e-9
     assert apart_m < 2 * CELL_M + HALF_STEP_RAD * reach_m  # a cell in x and in y, and what the yaw left open
-    assert found.num_inliers > 0.2 * len(source)  # random points, some two for each slice of a cell
+    assert found.num_inliers > 0.2 * len(source[0])  # random points, some two for each slice of a cell
 
 
 def test_sensors_that_lean_are_righted_by_their_up() -> None:
@@ -67,9 +102,9 @@ def test_sensors_that_lean_are_righted_by_their_up() -> None:
         for turn in ([0.2, 0.1, 0.0], [-0.1, 0.25, 0.0])
     ]
     T_leaning = leaning[1] @ T_target_source @ geometry.inverse(leaning[0])
-    source = geometry.apply(leaning[0] @ geometry.inverse(T_target_source), _court())
-    target = geometry.apply(leaning[1], _court())
-    plans = [FloorPlan(points, T[:3, :3] @ UP) for points, T in zip((source, target), leaning, strict=True)]
+    source = _seen_from(T_target_source @ geometry.inverse(leaning[0]), _court())
+    target = _seen_from(geometry.inverse(leaning[1]), _court())
+    plans = [_plan(walls, T[:3, :3] @ UP) for walls, T in zip((source, target), leaning, strict=True)]
     (found,) = plan_hypotheses(*plans, num_poses=1)
     apart_m, apart_rad = _error(found, T_leaning)
     assert apart_m < 2.0
@@ -77,27 +112,51 @@ def test_sensors_that_lean_are_righted_by_their_up() -> None:
 
 
 def test_hypotheses_differ_and_the_best_comes_first() -> None:
-    found = list(plan_hypotheses(FloorPlan(_court(), UP), FloorPlan(_court(), UP), num_poses=5))
+    found = list(plan_hypotheses(_plan(_court()), _plan(_court()), num_poses=5))
     assert len(found) == 5
     assert _error(found[0], np.eye(4)) == pytest.approx((0.0, 0.0), abs=1e-6)
     for k, one in enumerate(found):
         for other in found[:k]:
             apart_m, apart_rad = _error(one, other.T_target_source)
-            assert apart_m > 3 * CELL_M or apart_rad > 4 * HALF_STEP_RAD
+            assert apart_m > SAME_CELLS * CELL_M or apart_rad > 4 * HALF_STEP_RAD
 
 
 def test_order_of_points_changes_nothing() -> None:
     court = _court()
-    shuffled = np.random.default_rng(1).permutation(court)
-    target = FloorPlan(court, UP)
-    first, again = (next(plan_hypotheses(FloorPlan(points, UP), target, num_poses=1)) for points in (court, shuffled))
+    order = np.random.default_rng(1).permutation(len(court[0]))
+    shuffled = court[0][order], court[1][order]
+    first, again = (next(plan_hypotheses(_plan(walls), _plan(court), num_poses=1)) for walls in (court, shuffled))
     np.testing.assert_array_equal(first.T_target_source, again.T_target_source)
 
 
 def test_nothing_upright_gives_no_pose() -> None:
-    assert list(plan_hypotheses(FloorPlan(np.empty((0, 3)), UP), FloorPlan(_court(), UP), num_poses=3)) == []
-    far = _court() + np.array([200.0, 0.0, 0.0])
-    assert list(plan_hypotheses(FloorPlan(_court(), UP), FloorPlan(far, UP), num_poses=3)) == []
+    nothing = np.empty((0, 3)), np.empty((0, 3))
+    assert list(plan_hypotheses(_plan(nothing), _plan(_court()), num_poses=3)) == []
+    far = _court()[0] + np.array([200.0, 0.0, 0.0]), _court()[1]
+    assert list(plan_hypotheses(_plan(_court()), _plan(far), num_poses=3)) == []
+
+
+@pytest.mark.parametrize("yaw_deg", range(0, 360, 75))
+def test_scans_far_from_each_other_are_aligned_by_the_part_that_both_see(yaw_deg: int) -> None:
+    rng = np.random.default_rng(2)
+    corners = np.cumsum(rng.uniform(4.0, 12.0, 12)) - 40.0
+    sides = rng.uniform(7.0, 14.0, (2, 12)) * [[1.0], [-1.0]]
+    facades = [
+        ((x, y), (x + rng.uniform(3.0, 6.0), y), 4.0) for side in sides for x, y in zip(corners, side, strict=True)
+    ]
+    gables = [((x, y), (x, 1.4 * y), 4.0) for side in sides for x, y in zip(corners, side, strict=True)]
+    street = _walls((*facades, *gables))
+    T_target_source = geometry.transform(geometry.yaw(math.radians(yaw_deg)), np.array([30.0, 1.0, 0.0]))
+
+    def seen(T_here: Transform) -> Walls:
+        points, normals = _seen_from(T_here, street)
+        is_seen = np.linalg.norm(points, axis=1) < 35.0
+        return points[is_seen], normals[is_seen]
+
+    found = next(plan_hypotheses(_plan(seen(T_target_source)), _plan(seen(np.eye(4))), num_poses=1))
+    apart_m, apart_rad = _error(found, T_target_source)
+    assert apart_m < 2.5
+    assert apart_rad <= HALF_STEP_RAD + 1e-9
 
 
 @pytest.mark.parametrize(("num_plans", "aligned"), [(2, True), (0, False)])
@@ -107,7 +166,7 @@ def test_scans_that_share_nothing_but_walls_are_aligned_by_these(
     monkeypatch.setattr("segslam.verification.trial.MAX_PLAN_HYPOTHESES", num_plans)
     config = load_config(overrides=["segregator.features=never"])
     ground = np.column_stack([column.ravel() for column in np.mgrid[-4:14:0.3, -6:20:0.3, -1.7:-1.6:1]])
-    walls = _court(points_per_metre=60)
+    walls, _ = _walls(COURT, points_per_metre=60)
     labels = np.repeat(np.array([Label.ROAD, Label.BUILDING], np.uint8), [len(ground), len(walls)])
     target = np.concatenate([ground, walls])
     T_target_source = geometry.transform(geometry.yaw(2.5), np.array([5.0, 9.0, 0.0]))

@@ -18,6 +18,7 @@ from segslam.output.folder import copy_alone, new_folder
 from segslam.output.georeferenced import FILE, read_globe
 from segslam.output.log import Mirror, RunLog, read_log
 from segslam.run.run import Run
+from segslam.run.sessions.figures import parts_in
 from segslam.slam.loop_edits import NO_EDITS, LoopEdits, Pair
 from segslam.slam.slam import Slam
 
@@ -93,6 +94,7 @@ class Replay:
 def read_log_with_steps(run: Path) -> RunLog:
     """The log of a run, given its folder or the log. Raises SegslamError also for a log without a step."""
     recorded = read_log(run)
+    parts_in(recorded.options.get("sessions", ""))  # a damaged log is named as such, also without a step
     if recorded.num_steps() == 0:
         raise SegslamError(f"{recorded.path}: has no complete step; continue it (segslam resume), or map again")
     return recorded

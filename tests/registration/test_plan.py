@@ -159,6 +159,46 @@ def test_scans_far_from_each_other_are_aligned_by_the_part_that_both_see(yaw_deg
     assert apart_rad <= HALF_STEP_RAD + 1e-9
 
 
+def test_surroundings_that_are_dense_everywhere_show_no_pose() -> None:
+    def seen(T_here: Transform, seed: int) -> Walls:
+        """Two walls, and bushes around the sensor, which are others from each place."""
+        rng = np.random.default_rng(seed)
+        bushes = rng.uniform([-15.0, -15.0, -1.5], [15.0, 15.0, 1.5], (4000, 3))
+        directions = rng.normal(size=bushes.shape)
+        points, normals = _seen_from(T_here, _walls((((10, 0), (34, 0), 4.0), ((34, 0), (34, 16), 4.0)), 20))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        return np.concatenate([points, bushes]), np.concatenate([normals, directions])
+
+    T_target_source = geometry.transform(geometry.yaw(1.0), np.array([26.0, -4.0, 0.0]))
+    found = next(plan_hypotheses(_plan(seen(T_target_source, 1)), _plan(seen(np.eye(4), 2)), num_poses=1))
+    apart_m, apart_rad = _error(found, T_target_source)
+    assert apart_m < 2.5
+    assert apart_rad <= HALF_STEP_RAD + 1e-9
+
+
+def test_surfaces_of_other_directions_agree_less_than_fewer_of_the_same() -> None:
+    def pair_at(x: float, normal: tuple[float, float, float], number: int) -> Walls:
+        """Two blocks, 10 m apart along x."""
+        rng = np.random.default_rng(3)
+        block = rng.uniform([-1.0, -1.0, -1.0], [1.0, 1.0, 1.0], (number, 3))
+        points = np.concatenate([block + np.array([along, 5.0, 0.0]) for along in (x, x + 10.0)])
+        return points, np.tile(normal, (len(points), 1))
+
+    same, other = pair_at(-15.0, (1.0, 0.0, 0.0), 60), pair_at(8.0, (0.0, 1.0, 0.0), 80)
+    target = np.concatenate([same[0], other[0]]), np.concatenate([same[1], other[1]])
+    found = next(plan_hypotheses(_plan(pair_at(0.0, (1.0, 0.0, 0.0), 60)), _plan(target), num_poses=1))
+    np.testing.assert_allclose(found.T_target_source[:2, 3], [-15.0, 0.0], atol=CELL_M)
+
+
+def test_walls_far_from_both_scans_align_them() -> None:
+    walls = _walls((((-38, -30), (-38, 20), 5.0), ((-30, 40), (25, 40), 5.0), ((39, -10), (39, 30), 5.0)))
+    T_target_source = geometry.transform(geometry.yaw(2.0), np.array([3.0, -4.0, 0.0]))
+    found = next(plan_hypotheses(_plan(_seen_from(T_target_source, walls)), _plan(walls), num_poses=1))
+    apart_m, apart_rad = _error(found, T_target_source)
+    assert apart_m < 2.5
+    assert apart_rad <= HALF_STEP_RAD + 1e-9
+
+
 @pytest.mark.parametrize(("num_plans", "aligned"), [(2, True), (0, False)])
 def test_scans_that_share_nothing_but_walls_are_aligned_by_these(
     num_plans: int, aligned: bool, monkeypatch: pytest.MonkeyPatch

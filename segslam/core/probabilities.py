@@ -1,5 +1,7 @@
 """The two probabilities by which evidence is judged, in all stages."""
 
+import math
+
 from scipy.special import ndtri
 
 INLIER_PROBABILITY = 0.99
@@ -20,3 +22,17 @@ corrected if chance explains what fixes show of them with less."""
 def sigmas_beyond(probability: float) -> float:
     """Number of standard deviations that a normal variable exceeds, to either side, with this probability."""
     return float(-ndtri(0.5 * probability))
+
+
+def log_odds(probability: float) -> float:
+    """Log of how much more probable something is than its opposite (nats); at most 35, by the rounding of numbers."""
+    return math.log(max(probability, 1e-300)) - math.log(max(1.0 - probability, 1e-15))
+
+
+def log_chance(chi_square: float, dimensions: int) -> float:
+    """Log of the largest probability of a chi-square as large as this, whatever the distribution of the errors.
+
+    By Markov's inequality: its mean is the number of dimensions if their covariance is true. Errors of odometry are
+    often small and sometimes large.
+    """
+    return min(0.0, math.log(dimensions / max(chi_square, 1.0)))

@@ -23,7 +23,7 @@ from scipy.special import chdtri
 
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.probabilities import SIGNIFICANT
+from segslam.core.probabilities import INLIER_PROBABILITY, SIGNIFICANT
 from segslam.core.types import Information, Motion, MotionState, Scan, Transform
 from segslam.graph.edges import BREAK_M
 from segslam.graph.noise import odometry_information
@@ -32,7 +32,7 @@ from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel
 from segslam.odometry.search import PoseSearch, Recover
 from segslam.odometry.sweep import Foreseeing, Odometry, OdometryResult
-from segslam.registration.refinement import MIN_POINTS, SHARED_NOISE_DEG, SHARED_NOISE_M
+from segslam.registration.refinement import SHARED_NOISE_DEG, SHARED_NOISE_M
 
 ELSEWHERE_M = 30.0
 ANYWHERE = geometry.tangent(rotation_rad=np.radians(60.0), translation_m=ELSEWHERE_M)
@@ -119,7 +119,7 @@ class CheckedOdometry:
             self._motion.follow(self._since_last(proposed.T_odom_lidar), proposed.gap)
             return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
         self._num_unchecked = 0
-        if len(proposed.scan.thinned) < MIN_POINTS:
+        if proposed.scan.is_small:
             return self._of_few_points(proposed)
         if len(self._map) == 0:
             self._map.add(proposed.T_odom_lidar, proposed.scan)
@@ -128,8 +128,13 @@ class CheckedOdometry:
         return confirmed or self._registered(proposed)
 
     def _is_due(self, proposed: Proposed) -> bool:
-        """True if the motion is as long as a keyframe's since the last checked scan, or unlike the last motion."""
+        """True if the motion is as long as a keyframe's since the last checked scan, or unlike the last motion.
+
+        And for a scan too small to show it, with which KISS-ICP moves at random.
+        """
         if len(self._map) == 0 or self._is_watched or proposed.gap > 1.0 or self._num_unchecked >= MOST_UNCHECKED:
+            return True
+        if proposed.scan.is_small:
             return True
         moments = proposed.scan.moments
         moved_m = geometry.displacement_m(moments, proposed.T_odom_lidar, self._map.T_odom_map)
@@ -257,9 +262,12 @@ class CheckedOdometry:
     def _by_chance(self, search: PoseSearch, fits: Sequence[Fit], gap: float) -> float:
         """Probability that the scan is far from all poses that were tried, so that the best one fits by chance.
 
-        After a gap the sensor may be anywhere: the prior is that of the motion, the evidence the score of loops.
+        After a gap the sensor may be anywhere: the prior is that of the motion, the evidence the score of loops. Where
+        the best pose contradicts the last motions, these do not show either where else the sensor may be.
         """
         untried = self._motion.may_exceed(search.far_m, gap)
+        if fits and fits[0].log_prior < math.log(1.0 - INLIER_PROBABILITY):
+            untried = 1.0
         if not fits or untried < SIGNIFICANT:
             return untried
         return untried / (1.0 + math.exp(search.log_odds(fits[0])))

@@ -8,7 +8,7 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
-from segslam.core.points import voxel_means
+from segslam.core.points import voxel_first, voxel_means
 from segslam.core.types import Points, Registration, Transform
 from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.nudge import CHECK_VOXELS, NUM_POINTS, NUM_SEARCH, POLISH_VOXELS, SEARCH_VOXELS, nudge
@@ -34,10 +34,24 @@ class SeenScan:
         self.points = points
         self._config = config
 
+    @property
+    def _some(self) -> Points:
+        """Some hundred of the points."""
+        return self.points[:: max(1, len(self.points) // 500)]
+
     @cached_property
     def moments(self) -> geometry.Moments:
         """Of some hundred of the points, for `geometry.displacement_m`."""
-        return geometry.moments_of(self.points[:: max(1, len(self.points) // 500)].astype(np.float64))
+        return geometry.moments_of(self._some.astype(np.float64))
+
+    @cached_property
+    def is_small(self) -> bool:
+        """True if its downsampled points are too few to show its motion, as those of a wall just ahead of the sensor.
+
+        Most scans need not be downsampled to know: some hundred of their points are in enough voxels.
+        """
+        few = len(voxel_first(self._some, self._config.voxel_m)) < refinement.MIN_POINTS
+        return few and len(self.thinned) < refinement.MIN_POINTS
 
     @cached_property
     def thinned(self) -> Points:

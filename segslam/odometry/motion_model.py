@@ -7,7 +7,6 @@ again, relative to scans from before: the last motion, from a wrong position to 
 the change is large.
 """
 
-import math
 from collections import deque
 from collections.abc import Sequence
 from statistics import median
@@ -16,6 +15,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from segslam.core import geometry
+from segslam.core.probabilities import log_chance
 from segslam.core.types import Information, Motion, Transform, Vector
 from segslam.odometry.local_map import MAP_SCANS
 
@@ -94,15 +94,13 @@ class MotionModel:
     def log_prior(self, T_last_lidar: Transform, measured: Information, gap: float) -> float:
         """Log of the largest probability of a motion, measured with this covariance, as unlike the predicted one.
 
-        By Markov's inequality for its chi-square, whose mean is 6 whatever the distribution of changes: they are often
-        small and sometimes large. 0 while nothing is known of the motion.
+        0 while nothing is known of the motion.
         """
         prior = self._predicted_covariance(gap)
         if prior is None:
             return 0.0
         change = geometry.log(geometry.inverse(self.predicted(gap)) @ T_last_lidar)
-        chi_square = float(change @ np.linalg.solve(prior + measured, change))
-        return min(0.0, math.log(len(change) / max(chi_square, 1.0)))
+        return log_chance(float(change @ np.linalg.solve(prior + measured, change)), len(change))
 
     def may_exceed(self, reach_m: float, gap: float) -> float:
         """Probability that the motion over `gap` intervals ends farther than `reach_m` from the predicted one.

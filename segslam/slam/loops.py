@@ -58,7 +58,7 @@ class LoopCloser:
         self.submaps = Submaps(config, clouds, labeller, lambda: graph.motion_variance)
         self._prepared = lru_cache(NUM_PREPARED)(self.submaps.prepared)
         self._observed = lru_cache(NUM_PREPARED)(self.submaps.observed)
-        self._confirmation = Confirmation(graph)
+        self._confirmation = Confirmation(graph, config)
         self._far = FarLoops(config, graph, self._prepared, self._confirmation, edits.forbidden)
         self._tried: set[tuple[int, int]] = set(edits.forbidden)
         self._unsearched: set[int] = set()
@@ -128,6 +128,7 @@ class LoopCloser:
     def _take(self, attempts: tuple[LoopAttempt, ...]) -> None:
         for attempt in attempts:
             self._tried.add(attempt.candidate.pair)
+            self._confirmation.note(attempt)
             if isinstance(attempt.outcome, LoopClosure):
                 self._graph.add_closure(attempt.outcome)
                 self.detector.note_closure(attempt.outcome)

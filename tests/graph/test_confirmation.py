@@ -1,10 +1,21 @@
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+import pytest
 
 from segslam.core import geometry
-from segslam.core.config import GraphConfig
-from segslam.core.types import Alignment, LoopAttempt, LoopCandidate, LoopClosure, Registration
+from segslam.core.config import Config, GraphConfig
+from segslam.core.types import (
+    Alignment,
+    LoopAttempt,
+    LoopCandidate,
+    LoopClosure,
+    Registration,
+    Rejected,
+    RejectReason,
+    Transform,
+)
 from segslam.graph import PoseGraph
 from segslam.graph.confirmation import MIN_CONSISTENT, Confirmation
 from segslam.graph.motions import PLACE_M
@@ -21,12 +32,30 @@ def drive() -> PoseGraph:
     return graph
 
 
-def attempts(confirmation: Confirmation, graph: PoseGraph, source_id: int) -> Sequence[LoopAttempt]:
-    """A loop that agrees with the odometry, from this keyframe to one of the first."""
-    T_target_source = geometry.inverse(graph.T_world_keyframes[5]) @ graph.T_world_keyframes[source_id]
+STAYS: Transform = np.eye(4)
+COVARIANCE = np.diag([0.01, 0.01, 0.01, 1.0, 1.0, 1.0])
+
+
+def loop(
+    graph: PoseGraph, source_id: int, *, T_drift: Transform = STAYS, probability: float = 0.99
+) -> tuple[LoopCandidate, LoopClosure]:
+    """A loop from this keyframe to one of the first; by default, it agrees with the odometry."""
+    T_prior = geometry.inverse(graph.T_world_keyframes[5]) @ graph.T_world_keyframes[source_id]
+    T_target_source = geometry.inverse(graph.T_world_keyframes[5]) @ T_drift @ graph.T_world_keyframes[source_id]
     registration = Registration(T_target_source, 20, 20, 0.1, np.eye(6) * 1e4)
-    closure = LoopClosure.of(source_id, 5, Alignment(registration, registration, 0.9, 0.1, 0.0))
-    return confirmation.attempts(LoopCandidate(source_id, 5, T_target_source, 0.0), closure, {})
+    alignment = Alignment(registration, registration, 0.9, 0.1, 0.0, probability=probability)
+    return LoopCandidate(source_id, 5, T_prior, 0.0, COVARIANCE), LoopClosure.of(source_id, 5, alignment)
+
+
+def attempts(confirmation: Confirmation, graph: PoseGraph, source_id: int, **kind: Any) -> Sequence[LoopAttempt]:
+    """What becomes of such a loop."""
+    return confirmation.attempts(*loop(graph, source_id, **kind), {})
+
+
+def refuse(confirmation: Confirmation, source_id: int, target_id: int) -> None:
+    """Note that the best pose between these two was improbable."""
+    candidate = LoopCandidate(source_id, target_id, np.eye(4), 0.0)
+    confirmation.note(LoopAttempt(candidate, Rejected(RejectReason.AMBIGUOUS, "", probability=0.001), {}))
 
 
 def are_closed(found: Sequence[LoopAttempt]) -> bool:
@@ -35,7 +64,7 @@ def are_closed(found: Sequence[LoopAttempt]) -> bool:
 
 def test_registrations_wait_for_others_that_are_near() -> None:
     graph = drive()
-    confirmation = Confirmation(graph)
+    confirmation = Confirmation(graph, Config())
     sources = [190, 194, 197]
     for source_id in sources[:-1]:
         assert not are_closed(attempts(confirmation, graph, source_id))
@@ -48,10 +77,86 @@ def test_registrations_wait_for_others_that_are_near() -> None:
 
 def test_a_confirmation_leaves_those_that_wait_elsewhere() -> None:
     graph = drive()
-    confirmation = Confirmation(graph)
+    confirmation = Confirmation(graph, Config())
     far_id = 197 - int(2 * PLACE_M / STEP_M)
     attempts(confirmation, graph, far_id)
     for source_id in (190, 194, 197):
         found = attempts(confirmation, graph, source_id)
     assert {one.candidate.source_id for one in found} == {190, 194, 197}
     assert confirmation.is_waiting(far_id)
+
+
+BACK_M = -(190 - 5) * STEP_M
+"""With this drift along the drive, keyframe 190 is where keyframe 5 is."""
+DRIFT: Transform = geometry.transform(np.eye(3), [BACK_M, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(("probability", "are_probable"), [(0.99, True), (0.9, False)])
+def test_loops_that_agree_are_closed_if_together_they_are_probable(probability: float, are_probable: bool) -> None:
+    graph = drive()
+    confirmation = Confirmation(graph, Config())
+    for source_id in (190, 194, 197):
+        found = attempts(confirmation, graph, source_id, probability=probability)
+    assert are_closed(found) is are_probable
+    outcome = found[-1].outcome
+    assert are_probable or (isinstance(outcome, Rejected) and "contradict" in outcome.detail)
+
+
+@pytest.mark.parametrize(("target_id", "num_refused", "are_probable"), [(5, 0, True), (5, 12, False), (60, 12, True)])
+def test_refused_attempts_count_against_loops_with_which_their_keyframes_are_near_each_other(
+    target_id: int, num_refused: int, are_probable: bool
+) -> None:
+    graph = drive()
+    confirmation = Confirmation(graph, Config())
+    for number in range(num_refused):
+        refuse(confirmation, 190 + number % 3, target_id + number // 6)
+    for source_id in (190, 192, 193):
+        found = attempts(confirmation, graph, source_id, T_drift=DRIFT, probability=0.9995)
+    assert are_closed(found) is are_probable
+
+
+@pytest.mark.parametrize(("first_id", "are_probable"), [(100, True), (182, False)])
+def test_refused_attempts_count_within_a_stretch_of_the_drive(first_id: int, are_probable: bool) -> None:
+    graph = drive()
+    confirmation = Confirmation(graph, Config())
+    for number in range(12):
+        refuse(confirmation, first_id + number, first_id + number - 2)
+    for source_id in (190, 192, 193):
+        found = attempts(confirmation, graph, source_id)
+    assert are_closed(found) is are_probable
+
+
+def test_loops_that_lead_elsewhere_count_against_others_nearby() -> None:
+    elsewhere: Transform = geometry.transform(np.eye(3), [BACK_M + 25.0, 0.0, 0.0])
+    closed = []
+    for num_elsewhere in (0, 6):
+        graph = drive()
+        confirmation = Confirmation(graph, Config())
+        for number in range(num_elsewhere):
+            attempts(confirmation, graph, 187 + number // 3, T_drift=elsewhere)
+        for source_id in (190, 192, 193):
+            found = attempts(confirmation, graph, source_id, T_drift=DRIFT, probability=0.9995)
+        closed.append(are_closed(found))
+    assert closed == [True, False]
+
+
+def test_loops_that_contradict_the_odometry_must_be_more_probable() -> None:
+    turned: Transform = geometry.transform(geometry.yaw(np.pi), [0.0, 0.0, 0.0])
+    graph = drive()
+    confirmation = Confirmation(graph, Config())
+    T_drift: Transform = graph.T_world_keyframes[5] @ turned @ geometry.inverse(graph.T_world_keyframes[190])
+    for source_id in (190, 192, 193):
+        found = attempts(confirmation, graph, source_id, T_drift=T_drift, probability=0.98)
+    assert not are_closed(found)
+
+
+@pytest.mark.parametrize(("source_id", "are_probable"), [(188, False), (150, True)])
+def test_loops_that_were_closed_nearby_count_against_others_that_contradict_them(
+    source_id: int, are_probable: bool
+) -> None:
+    graph = drive()
+    confirmation = Confirmation(graph, Config())
+    confirmation.note(LoopAttempt(*loop(graph, source_id), {}))
+    for later_id in (190, 192, 193):
+        found = attempts(confirmation, graph, later_id, T_drift=DRIFT, probability=0.9995)
+    assert are_closed(found) is are_probable

@@ -336,6 +336,38 @@ def test_a_sudden_turn_is_found_by_the_search_around_the_last_pose(degrees: floa
     assert np.degrees(geometry.angle(T_true_found)) < 0.3
 
 
+def test_a_turn_that_no_search_reaches_is_recognised_where_the_found_pose_contradicts_the_last_motions(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Also if no other pose is nearly as likely."""
+    monkeypatch.setattr(PoseSearch, "elsewhere", lambda search, fits: 0.0)
+    scans, truth = round_drive()
+    turn = geometry.transform(geometry.yaw(np.radians(100.0)), np.zeros(3))
+    turned = replace(scans[SLIP_AT], points=geometry.apply(geometry.inverse(turn), scans[SLIP_AT].points))
+    odometry = CheckedOdometry(_LikeKiss(truth, CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
+    results = _registered(odometry, [*scans[:SLIP_AT], turned])
+    before, now = truth.T_world_lidar[SLIP_AT - 1 : SLIP_AT + 1]
+    T_before_found = geometry.inverse(results[-2].T_odom_lidar) @ results[-1].T_odom_lidar
+    T_true_found = geometry.inverse(now @ turn) @ before @ T_before_found
+    assert geometry.distance(T_true_found) < 0.1
+    assert np.degrees(geometry.angle(T_true_found)) < 0.3
+
+
+@pytest.mark.parametrize("is_small", [True, False])
+def test_a_scan_of_a_few_points_is_checked_however_little_it_moves(
+    is_small: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """KISS-ICP moves as it did before with any scan, and at random with a wall just ahead of the sensor."""
+    scans, truth = round_drive()
+    odometry = CheckedOdometry(_LikeKiss(truth, CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
+    results = _registered(odometry, scans[:5])
+    monkeypatch.setattr(CheckedOdometry, "_is_watched", False)
+    T_odom_lidar = results[-1].T_odom_lidar
+    every = 700 if is_small else 1
+    seen = SeenScan(scans[5].points[::every], CONFIG.refine)
+    assert odometry._is_due(Proposed(seen, T_odom_lidar, T_odom_lidar, 1.0)) is is_small
+
+
 def test_of_two_poses_that_explain_a_scan_nearly_as_well_the_usual_motion_is_more_likely() -> None:
     model = MotionModel()
     step = geometry.transform(np.eye(3), [1.0, 0.0, 0.0])

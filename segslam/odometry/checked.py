@@ -43,8 +43,9 @@ MOST_OFF = float(chdtri(6, SIGNIFICANT))
 """Chi-square above which a pose of the odometry is significantly off the registered one."""
 MOST_OFF_TOGETHER = float(chdtri(6 * WINDOW, SIGNIFICANT))
 """Sum of these chi-squares above which an odometry is less sure than the registrations of its last scans."""
-MOST_UNCHECKED = 9
-"""Chosen: number of scans after which a sensor that seems to stand still is checked."""
+MOST_UNCHECKED = 2
+"""Chosen: number of scans after which a sensor that seems to stand still is checked: it may have begun to turn. Turns
+of 15 degrees a scan are then within the reach of the search."""
 
 
 class Proposed(NamedTuple):

@@ -1004,4 +1004,29 @@ def test_an_odometry_that_reports_no_motion_is_checked_too() -> None:
     given = GivenOdometry(Trajectory(np.arange(21), np.arange(21) * 100_000_000, poses), CONFIG.odometry)
     results = _registered(CheckedOdometry(given, CONFIG, recover=partial(register, config=CONFIG)), standing)
     checked = [row for row, result in enumerate(results) if result.motion and result.motion.overlap is not None]
-    assert checked == [10, 20]
+    assert checked == list(range(3, 21, 3))
+
+
+def test_a_turn_that_the_odometry_does_not_follow_is_found_while_the_search_reaches_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The odometry agreed with the scans before, and its poses stay where they were."""
+    scans, truth = round_drive()
+    last = scans[SLIP_AT - 1]
+    turns = [geometry.transform(geometry.yaw(np.radians(15.0 * count)), np.zeros(3)) for count in range(1, 7)]
+    turned = [
+        replace(scans[SLIP_AT + row], points=geometry.apply(geometry.inverse(turn), last.points), labels=last.labels)
+        for row, turn in enumerate(turns)
+    ]
+    poses = truth.T_world_lidar.copy()
+    poses[SLIP_AT:] = poses[SLIP_AT - 1]
+    none = Rejected(RejectReason.HIGH_RESIDUAL)
+    trajectory = replace(truth, T_world_lidar=poses)
+    odometry = CheckedOdometry(_LikeKiss(trajectory, CONFIG.odometry), CONFIG, recover=lambda source, target: none)
+    before = _registered(odometry, scans[:SLIP_AT])[-1].T_odom_lidar
+    monkeypatch.setattr(CheckedOdometry, "_is_watched", False)
+    results = zip(turns, _registered(odometry, turned), strict=True)
+    offs = [geometry.inverse(before @ turn) @ result.T_odom_lidar for turn, result in results]
+    best = min(offs[-3:], key=geometry.angle)
+    assert geometry.distance(best) < 0.1
+    assert np.degrees(geometry.angle(best)) < 0.5

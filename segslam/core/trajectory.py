@@ -4,6 +4,7 @@ A pose file does not name its frames: the reader returns T_a_b as stored in the 
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -178,10 +179,22 @@ def rows_of_same_scan(scan_index_a: Indices, scan_index_b: Indices) -> IndexPair
     return np.column_stack([rows_a, rows_b])
 
 
-def travelled_m(T_a_b: Poses) -> np.ndarray:
-    """(n,) length of the path from the first pose to each pose (m)."""
+def travelled_m(T_a_b: Poses, begun: Indices | Sequence[int] = ()) -> np.ndarray:
+    """(n,) length of the path from the first pose to each pose (m), without the ways to those of the rows `begun`."""
     steps = np.linalg.norm(np.diff(T_a_b[:, :3, 3], axis=0), axis=1)
+    steps[[row - 1 for row in begun if 0 < row < len(T_a_b)]] = 0.0
     return np.concatenate([np.zeros(min(1, len(T_a_b))), np.cumsum(steps)])
+
+
+def begun_among(rows: Indices, begun: Indices) -> Indices:
+    """The rows among some scans, themselves `rows`, before which another drive begins."""
+    firsts = np.unique(np.searchsorted(rows, begun))
+    return firsts[(firsts > 0) & (firsts < len(rows))]
+
+
+def parted(values: np.ndarray, begun: Indices | Sequence[int]) -> np.ndarray:
+    """Values (n, ...) with one of NaN before each of these rows: a line through them is drawn with gaps there."""
+    return np.insert(values.astype(np.float64), np.asarray(begun, np.int64), np.nan, axis=0)
 
 
 def corrected_poses(

@@ -14,7 +14,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from segslam.core.config import MapConfig, load_config
-from segslam.core.types import Indices, Keyframe, Mask, MotionState, SegslamError, Transform
+from segslam.core.types import Indices, Keyframe, Mask, MotionState, SegslamError, Step, Transform
 from segslam.core.whole_files import all_expanded, cannot_write, expanded, whole_file
 from segslam.output.finished import read_corrections
 from segslam.output.folder import PLACE_ON_GLOBE, read_localised
@@ -85,7 +85,8 @@ def write_maps(
         if not of_map:
             return {"map_seconds": perf_counter() - started}
         try:
-            made = write_map(_placed(log, globe, show), of_map, config=config, origin=origin, show=show)
+            placed, begun = _placed(log, globe, show), {step.scan_index for step in _begun(log).values()}
+            made = write_map(placed, of_map, config=config, origin=origin, begun=begun, show=show)
         except OSError as error:
             raise cannot_write(of_map[0], error) from error
     return {**made, "map_seconds": perf_counter() - started}
@@ -119,10 +120,14 @@ def _in_map(log: RunLog) -> Mask:
 
 def _cuts(log: RunLog, rows: Indices) -> list[int]:
     """The places among the scans `rows` where another drive of a merged run begins, or scans are missing."""
-    steps = enumerate(log.steps(clouds=False))
-    begun = [row for row, step in steps if step.motion is not None and step.motion.state is MotionState.BEGUN]
-    cuts: list[int] = (np.flatnonzero((np.diff(rows) > 1) | np.isin(rows[1:], begun)) + 1).tolist()
+    cuts: list[int] = (np.flatnonzero((np.diff(rows) > 1) | np.isin(rows[1:], list(_begun(log)))) + 1).tolist()
     return cuts
+
+
+def _begun(log: RunLog) -> dict[int, Step]:
+    """The scans with which another drive of a merged run begins, by row."""
+    steps = enumerate(log.steps(clouds=False))
+    return {row: step for row, step in steps if step.motion is not None and step.motion.state is MotionState.BEGUN}
 
 
 def is_track(file: Path) -> bool:

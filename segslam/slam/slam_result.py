@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from segslam.core.evaluation import align_positions, trajectory_metrics
-from segslam.core.trajectory import Poses, as_poses, camera_from_lidar, rows_of_same_scan, write_kitti, write_tum
+from segslam.core.trajectory import (
+    Poses,
+    as_poses,
+    begun_among,
+    camera_from_lidar,
+    parted,
+    rows_of_same_scan,
+    write_kitti,
+    write_tum,
+)
 from segslam.core.types import (
     GraphEstimate,
     Indices,
@@ -17,6 +26,7 @@ from segslam.core.types import (
     LoopClosure,
     Mask,
     Motion,
+    MotionState,
     Record,
     Rejected,
     SegslamError,
@@ -74,6 +84,11 @@ class SlamResult(Record):
             return np.ones(len(self.trajectory), dtype=bool)
         return self.from_map_m <= TRUSTED_M
 
+    @property
+    def begun(self) -> Indices:
+        """Rows of the scans with which another drive of a merged run begins."""
+        return np.array([row for row, one in enumerate(self.motions) if one.state is MotionState.BEGUN], np.int64)
+
     def keyframe_informations(self) -> list[Information | None]:
         """Information of the motion from the previous keyframe to each; None for the noise model of odometry.
 
@@ -103,7 +118,8 @@ class SlamResult(Record):
         A `Trajectory` is matched by scan number; an array (n, 4, 4) has one pose per scan. Raises SegslamError for
         another number of poses, or if fewer than 3 scans have a ground-truth pose.
         """
-        poses, truth = self._matched(reference)
+        rows, truth = self._matched(reference)
+        poses = self.trajectory.T_world_lidar[rows]
         figures = trajectory_metrics(poses, truth)
         if not figures:
             raise SegslamError(f"{len(poses)} scans have a true pose; at least three are needed")
@@ -117,14 +133,15 @@ class SlamResult(Record):
         figure = Figure(figsize=(7, 6), layout="constrained")
         axes = figure.subplots()
         if reference is not None:
-            poses, truth = self._matched(reference)
-            T_show_world = align_positions(poses[:, :3, 3], truth[:, :3, 3])
-            axes.plot(*truth[:, :2, 3].T, color="#B8B8B8", linewidth=4, label="reference")
+            rows, truth = self._matched(reference)
+            T_show_world = align_positions(self.trajectory.T_world_lidar[rows, :3, 3], truth[:, :3, 3])
+            drawn = parted(truth[:, :2, 3], begun_among(rows, self.begun))
+            axes.plot(*drawn.T, color="#B8B8B8", linewidth=4, label="reference")
         corrected, odometry = (
             (T_show_world @ drive.T_world_lidar)[:, :2, 3] for drive in (self.trajectory, self.odometry)
         )
-        axes.plot(*odometry.T, "--", color="#E69F00", linewidth=1.4, label="odometry")
-        axes.plot(*corrected.T, color="#0072B2", linewidth=1.4, label="corrected")
+        axes.plot(*parted(odometry, self.begun).T, "--", color="#E69F00", linewidth=1.4, label="odometry")
+        axes.plot(*parted(corrected, self.begun).T, color="#0072B2", linewidth=1.4, label="corrected")
         closures = self.closures()
         for closure in closures:
             ends = corrected[self.keyframe_rows[[closure.source_id, closure.target_id]]]
@@ -158,16 +175,16 @@ class SlamResult(Record):
             ],
         }
 
-    def _matched(self, reference: Trajectory | Poses) -> tuple[Poses, Poses]:
-        """Corrected and ground-truth poses of the scans that have both."""
+    def _matched(self, reference: Trajectory | Poses) -> tuple[Indices, Poses]:
+        """Rows of the scans that have ground truth, and their true poses."""
         own = self.trajectory
         if isinstance(reference, Trajectory):
             rows = rows_of_same_scan(own.scan_index, reference.scan_index)
-            return own.T_world_lidar[rows[:, 0]], reference.T_world_lidar[rows[:, 1]]
+            return rows[:, 0], reference.T_world_lidar[rows[:, 1]]
         truth = as_poses(reference, "reference")
         if len(truth) != len(own):
             raise SegslamError(f"reference: {len(truth)} poses for {len(own)} scans; give one for each, (n, 4, 4)")
-        return own.T_world_lidar, truth
+        return np.arange(len(own)), truth
 
 
 def outcome_text(attempt: LoopAttempt, closure_weights: Mapping[tuple[int, int], float]) -> str:

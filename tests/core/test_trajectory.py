@@ -256,3 +256,12 @@ def test_correction_needs_a_pose_for_each_keyframe(rows: list[int]) -> None:
 @pytest.mark.data
 def test_official_ground_truth_reads_with_its_length(data_dir: Path) -> None:
     assert len(trajectory.read_poses(data_dir / "kitti" / "poses" / "04.txt")) == 271
+
+
+def test_the_way_to_another_drive_is_neither_travelled_nor_drawn() -> None:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = [0.0, 1.0, 9.0, 11.0]
+    np.testing.assert_array_equal(trajectory.travelled_m(poses), [0.0, 1.0, 9.0, 11.0])
+    np.testing.assert_array_equal(trajectory.travelled_m(poses, [2]), [0.0, 1.0, 1.0, 3.0])
+    np.testing.assert_array_equal(trajectory.travelled_m(poses, [0, 4]), trajectory.travelled_m(poses))
+    np.testing.assert_array_equal(trajectory.parted(np.arange(4), [2]), [0.0, 1.0, np.nan, 2.0, 3.0])

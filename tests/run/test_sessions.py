@@ -13,6 +13,7 @@ from helpers.commands import run
 from helpers.gnss_drive import ORIGIN, T_ENU_MAP, write_fixes
 from helpers.sessions import write_day
 from helpers.terminal import in_terminal
+from matplotlib.figure import Figure
 
 import segslam
 from segslam.core import geometry
@@ -22,6 +23,8 @@ from segslam.core.types import LoopClosure, MotionState, Trajectory
 from segslam.gnss import enu_from_geodetic
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.log import read_log
+from segslam.output.map import picture
+from segslam.output.report import figures
 from segslam.run.sessions.figures import Part, figures_of
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("short_runs")]
@@ -95,6 +98,22 @@ def test_two_days_become_one_frame(days: Days, merged: FinishedRun) -> None:
 def test_the_way_between_the_sessions_of_a_run_does_not_count_if_it_is_merged_again(merged: FinishedRun) -> None:
     as_one = Part(first_keyframe=0, num_scans=len(merged.result.trajectory))
     assert figures_of([as_one], merged.result)["length_m"] == pytest.approx(merged.metrics["length_m"])
+
+
+def test_pictures_of_a_merged_run_do_not_show_the_way_between_its_drives(
+    merged: FinishedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[np.ndarray] = []
+    monkeypatch.setattr(picture, "drawn_map", lambda *_, path_m, **__: drawn.append(path_m) or b"")
+    segslam.export(merged.folder, tmp_path / "map.png")
+    shown: list[Figure] = [merged.result.plot(merged.reference)]
+    monkeypatch.setattr(figures, "svg", lambda figure, _: shown.append(figure) or "")
+    for draw in (figures.draw_paths, figures.draw_loops, figures.draw_errors):
+        draw(merged)
+    long = [line for figure in shown for axes in figure.axes for line in axes.lines if len(line.get_xdata()) > 40]
+    drawn += [np.column_stack([line.get_xdata(), line.get_ydata()]) for line in long]
+    assert len(drawn) >= 10
+    assert {int(np.isnan(line).any(axis=1).sum()) for line in drawn} == {1}
 
 
 def test_scans_and_stamps_of_the_second_session_follow_the_first(days: Days, merged: FinishedRun) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
+from segslam.core.trajectory import parted
 from segslam.core.types import Points, SegslamError, Vector
 from segslam.labels.encodings import COLORS, Colors
 from segslam.output.map.from_above import Window, drawn_map, visible
@@ -62,7 +63,7 @@ class Picture:
         image, window, _ = self._finished()
         del self._image, self._height_m  # drawing needs as much memory again
         titles = {"class": "class", "height": "height (m)", "intensity": "intensity"}
-        title, path_m = titles[self._store.config.color], self._store.path_m
+        title, path_m = titles[self._store.config.color], parted(self._store.path_m, self._store.begun)
         self._file.write_bytes(drawn_map(image, window, path_m=path_m, title=title, marks=self._marks()))
 
     def _finished(self) -> tuple[np.ndarray, Window, float]:

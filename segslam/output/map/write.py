@@ -6,7 +6,7 @@ and one tile, whatever the length of the drive.
 """
 
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import cached_property
 from importlib.util import find_spec
@@ -90,6 +90,7 @@ def write_map(
     *,
     config: MapConfig,
     origin: "Origin | None" = None,
+    begun: Container[int] = (),
     show: Progress = no_progress,
 ) -> dict[str, int]:
     """Make the map of the keyframes, each with its T_world_keyframe, and write it to files; returns its figures.
@@ -103,6 +104,8 @@ def write_map(
     with temporary_folder(files[0].parent, ".map-") as scratch:
         store = MapStore(scratch, config, origin)
         for keyframe, T_world_keyframe in placed:
+            if keyframe.scan_index in begun:
+                store.begun.append(len(store.places))
             store.add(keyframe, T_world_keyframe)
         if not len(store.tiles):
             raise SegslamError(f"{files[0]}: no keyframe of known pose has a static point; there is nothing to map")
@@ -148,6 +151,8 @@ class MapStore:
         self._T_keyframe_world: list[Transform] = []
         self.places: list[Vector] = []
         """Position of each keyframe in the world (m)."""
+        self.begun: list[int] = []
+        """The rows of `places` at which another drive begins."""
         self.free_m: list[Vector] = []
         """Free range of each keyframe, by direction in the world: `grid.free_range_m`."""
         self.has_intensities = True

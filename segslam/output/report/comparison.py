@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from segslam.core.evaluation import Up, align_positions
-from segslam.core.trajectory import Poses, rows_of_same_scan
+from segslam.core.trajectory import Poses, begun_among, parted, rows_of_same_scan
 from segslam.core.types import SegslamError
 from segslam.core.whole_files import check_target, whole_file
 from segslam.output.accuracy import AFTER, Align, aligned_by
@@ -96,8 +96,9 @@ def _plot_group(above: Axes, error: Axes, runs: Mapping[str, FinishedRun], color
         target = common.T_world_lidar[rows[:, 1]]
         if len(rows):
             poses = align_positions(poses[rows[:, 0], :3, 3], target[:, :3, 3]) @ poses
-            figures.plot_error(error, name, poses[rows[:, 0]], target, colors[name])
-        _plot_above(above, name, poses, colors[name])
+            begun = begun_among(rows[:, 0], run.result.begun)
+            figures.plot_error(error, name, poses[rows[:, 0]], target, colors[name], begun)
+        _plot_above(above, name, parted(poses, run.result.begun), colors[name])
 
 
 def _plot_above(axes: Axes, name: str, poses: Poses, color: str, *, width: float = 1.4, up: Up = "z") -> None:

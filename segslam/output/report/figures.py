@@ -3,6 +3,7 @@
 import csv
 import io
 from collections import defaultdict
+from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 
 from segslam.core.evaluation import align_positions, false_loops, pose_errors
-from segslam.core.trajectory import Poses, rows_of_same_scan, travelled_m
+from segslam.core.trajectory import Poses, begun_among, parted, rows_of_same_scan, travelled_m
 from segslam.core.types import Indices, MotionState, Rejected, RejectReason
 from segslam.output.accuracy import aligned_by, judged_closures
 from segslam.output.finished import FinishedRun
@@ -44,6 +45,8 @@ class Line(NamedTuple):
     color: str
     style: str
     width: float
+    begun: Indices
+    """Rows at which another drive begins."""
 
 
 def true_scans(run: FinishedRun) -> tuple[Indices, Poses] | None:
@@ -56,11 +59,11 @@ def true_scans(run: FinishedRun) -> tuple[Indices, Poses] | None:
 
 def _estimates_of(run: FinishedRun) -> list[Line]:
     """The trajectories of a run, of which the last is the corrected one."""
-    alone = run.result.alone
+    alone, begun = run.result.alone, run.result.begun
     return [
-        *([] if alone is None else [Line("KISS-ICP alone", alone.T_world_lidar, ALONE, ":", 1.5)]),
-        Line("odometry", run.result.odometry.T_world_lidar, ODOMETRY, "--", 1.5),
-        Line("corrected", run.result.trajectory.T_world_lidar, CORRECTED, "-", 1.2),
+        *([] if alone is None else [Line("KISS-ICP alone", alone.T_world_lidar, ALONE, ":", 1.5, begun)]),
+        Line("odometry", run.result.odometry.T_world_lidar, ODOMETRY, "--", 1.5, begun),
+        Line("corrected", run.result.trajectory.T_world_lidar, CORRECTED, "-", 1.2, begun),
     ]
 
 
@@ -70,7 +73,8 @@ def paths_of(run: FinishedRun) -> list[Line]:
     if (true := true_scans(run)) is not None:
         rows, truth = true
         T_world_truth = align_positions(truth[:, :3, 3], paths[-1].poses[rows, :3, 3])
-        paths.insert(0, Line("truth", T_world_truth @ truth, TRUTH, "-", 4.0))
+        begun = begun_among(rows, run.result.begun)
+        paths.insert(0, Line("truth", T_world_truth @ truth, TRUTH, "-", 4.0, begun))
     return paths
 
 
@@ -82,9 +86,9 @@ def draw_paths(run: FinishedRun) -> str:
     _plot_motions(above, run, paths[-1].poses)
     for line in paths:
         style: Any = {"color": line.color, "linewidth": line.width}
-        above.plot(*line.poses[:, :2, 3].T, line.style, label=line.name, **style)
+        above.plot(*parted(line.poses[:, :2, 3], line.begun).T, line.style, label=line.name, **style)
         above.plot(*line.poses[0, :2, 3], "o", color=line.color, markersize=5)
-        height.plot(travelled_m(line.poses), line.poses[:, 2, 3], line.style, **style)
+        height.plot(*_along(line.poses, line.poses[:, 2, 3], line.begun), line.style, **style)
     _finish_map(above)
     height.set(xlabel="distance travelled (m)", ylabel="height (m)")
     return svg(figure, "paths")
@@ -95,7 +99,8 @@ def draw_loops(run: FinishedRun) -> str:
     figure = Figure(figsize=(WIDTH_IN, 5.6), layout="constrained")
     axes = figure.subplots()
     positions = run.result.trajectory.T_world_lidar[:, :2, 3]
-    axes.plot(*positions.T, color="#BBBBBB", linewidth=1.2, zorder=1, label="trajectory")
+    drawn = parted(positions, run.result.begun)
+    axes.plot(*drawn.T, color="#BBBBBB", linewidth=1.2, zorder=1, label="trajectory")
     axes.plot(*positions[0], "o", color="#BBBBBB", markersize=5, zorder=1)
     ends = positions[run.result.keyframe_rows]
     for label, color, is_closed, pairs in _by_outcome(run):
@@ -132,11 +137,12 @@ def draw_errors(run: FinishedRun) -> str | None:
     rows, truth = true
     figure = Figure(figsize=(WIDTH_IN, 5.4), layout="constrained")
     whole, height = figure.subplots(2, 1, sharex=True)
+    begun = begun_among(rows, run.result.begun)
     for line in _estimates_of(run):
         aligned = aligned_by(line.poses[rows], truth, "se3")
         is_repaired = line.name == "odometry" and run.result.alone is not None
-        plot_error(whole, f"{line.name}{' after repairs' * is_repaired}", aligned, truth, line.color)
-        height.plot(travelled_m(truth), (aligned - truth)[:, 2, 3], color=line.color, linewidth=1.4)
+        plot_error(whole, f"{line.name}{' after repairs' * is_repaired}", aligned, truth, line.color, begun)
+        height.plot(*_along(truth, (aligned - truth)[:, 2, 3], begun), color=line.color, linewidth=1.4)
     whole.set(ylabel="error (m)")
     whole.set_ylim(bottom=0)
     height.set(xlabel="distance travelled (m)", ylabel="height error (m)")
@@ -144,11 +150,18 @@ def draw_errors(run: FinishedRun) -> str | None:
     return svg(figure, "errors")
 
 
-def plot_error(axes: Axes, name: str, aligned: Poses, reference: Poses, color: str) -> None:
-    """Draw the position error of aligned poses against the distance travelled."""
+def _along(poses: Poses, values: np.ndarray, begun: Indices) -> tuple[np.ndarray, np.ndarray]:
+    """Distances travelled and values (n,), to be drawn with a gap where another drive begins."""
+    return parted(travelled_m(poses, begun), begun), parted(values, begun)
+
+
+def plot_error(
+    axes: Axes, name: str, aligned: Poses, reference: Poses, color: str, begun: Indices | Sequence[int] = ()
+) -> None:
+    """Draw the position error of aligned poses against the distance travelled; drives begin at the rows `begun`."""
     error_m = pose_errors(aligned, reference).translation_m
     label = f"{name}, rms {np.sqrt(np.mean(error_m**2)):.2f} m"
-    axes.plot(travelled_m(reference), error_m, color=color, label=label, linewidth=1.4)
+    axes.plot(*_along(reference, error_m, np.asarray(begun)), color=color, label=label, linewidth=1.4)
 
 
 def draw_stages(stage_ms: dict[str, dict[str, float]]) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 
 from segslam.core.errors import brief
 from segslam.core.trajectory import travelled_m
-from segslam.core.types import REJECTED_WEIGHT, MotionState, SegslamError
+from segslam.core.types import REJECTED_WEIGHT, SegslamError
 from segslam.slam.slam import SlamResult
 
 
@@ -39,11 +39,11 @@ def figures_of(sessions: Sequence[Part], result: SlamResult) -> dict[str, Any]:
         if len(set(np.searchsorted(first_ids, ids, side="right").tolist())) > 1
     ]
     ends = np.cumsum([session.num_scans for session in sessions])
-    begun = [row for row, motion in enumerate(result.motions) if motion.state is MotionState.BEGUN]
-    drives = np.split(result.trajectory.T_world_lidar, np.unique([*ends[:-1], *begun]).astype(int))
+    begun = np.unique([*ends[:-1], *result.begun]).astype(np.int64)
+    T_world_lidar = result.trajectory.T_world_lidar
     return {
         "num_sessions": len(sessions),
-        "length_m": sum(float(travelled_m(drive)[-1]) for drive in drives if len(drive)),
+        "length_m": float(travelled_m(T_world_lidar, begun)[-1]),
         "num_loops_between": len(between),
         "num_loops_between_switched_off": sum(weight < REJECTED_WEIGHT for weight in between),
     }

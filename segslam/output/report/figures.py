@@ -150,7 +150,7 @@ def draw_errors(run: FinishedRun) -> str | None:
     return svg(figure, "errors")
 
 
-def _along(poses: Poses, values: np.ndarray, begun: Indices) -> tuple[np.ndarray, np.ndarray]:
+def _along(poses: Poses, values: np.ndarray, begun: Indices | Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Distances travelled and values (n,), to be drawn with a gap where another drive begins."""
     return parted(travelled_m(poses, begun), begun), parted(values, begun)
 
@@ -161,7 +161,7 @@ def plot_error(
     """Draw the position error of aligned poses against the distance travelled; drives begin at the rows `begun`."""
     error_m = pose_errors(aligned, reference).translation_m
     label = f"{name}, rms {np.sqrt(np.mean(error_m**2)):.2f} m"
-    axes.plot(*_along(reference, error_m, np.asarray(begun)), color=color, label=label, linewidth=1.4)
+    axes.plot(*_along(reference, error_m, begun), color=color, label=label, linewidth=1.4)
 
 
 def draw_stages(stage_ms: dict[str, dict[str, float]]) -> str:

@@ -1,4 +1,4 @@
-"""The two probabilities by which evidence is judged, in all stages."""
+"""The two probabilities by which evidence is judged, in all stages, and functions of probabilities."""
 
 import math
 

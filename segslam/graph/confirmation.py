@@ -20,7 +20,7 @@ from segslam.core.probabilities import log_chance, log_odds
 from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Mask, Rejected, RejectReason
 from segslam.graph import Graph
 from segslam.graph.motions import PLACE_M
-from segslam.verification.score import MISLED
+from segslam.verification.score import MISLED, log_odds_of_all
 
 MIN_CONSISTENT = 3
 """Chosen: number of registrations of keyframes that must be consistent, of more than one place."""
@@ -36,7 +36,7 @@ class Confirmation:
     def __init__(self, graph: Graph, config: Config) -> None:
         self._graph = graph
         self._radius_m = config.proximity.base_radius_m
-        self._least_odds = log_odds(1.0 - config.verify.max_false_share)
+        self._least_odds = log_odds_of_all(config.verify)
         self._waiting: list[Attempted] = []
         self._refused: list[tuple[tuple[int, int], float]] = []
         """Pairs whose best pose was not probable enough, and its log odds."""

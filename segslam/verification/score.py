@@ -81,7 +81,7 @@ class Table:
 
     def least_odds(self, config: VerifyConfig) -> float:
         """Log odds that an accepted pose has at least, for a share of false ones of `max_false_share` in all."""
-        return math.log((1.0 - config.max_false_share) / config.max_false_share) - self.margin
+        return log_odds_of_all(config) - self.margin
 
     @property
     def most_log_odds(self) -> float:
@@ -148,6 +148,11 @@ class Table:
         weights = self.weights
         least_unique = (least_odds + RIVAL_NATS - weights.shift) / weights.slope
         return (least_unique - self._unique(counts, 0.0)) / weights.lead
+
+
+def log_odds_of_all(config: VerifyConfig) -> float:
+    """Log odds that accepted poses have together, for a share of false ones of `max_false_share`."""
+    return math.log((1.0 - config.max_false_share) / config.max_false_share)
 
 
 def paired_lead(ratios: Vector, pairs: Sequence[tuple[Shown, Shown]]) -> float:

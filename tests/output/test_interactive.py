@@ -110,7 +110,7 @@ def test_long_drives_are_thinned(made: MadeRun, monkeypatch: pytest.MonkeyPatch)
         assert len(chosen) == min(most, 10)
         assert [one.outcome.ok for one in chosen] == [True] * num_accepted + [False] * (len(chosen) - num_accepted)
     for num in (1, MOST_SCANS, MOST_SCANS + 1, 3 * MOST_SCANS):
-        assert 0 < len(loops._thinned(np.zeros((num, 3)))) <= MOST_SCANS
+        assert 0 < len(loops._thinned(np.zeros((num, 3)), np.empty(0, np.int64))) <= MOST_SCANS
 
 
 def _shown(page: str, folder: Path, *options: str) -> str:

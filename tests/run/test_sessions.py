@@ -24,7 +24,8 @@ from segslam.gnss import enu_from_geodetic
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.log import read_log
 from segslam.output.map import picture
-from segslam.output.report import figures
+from segslam.output.report import comparison, figures
+from segslam.output.report.loops import top_view
 from segslam.run.sessions.figures import Part, figures_of
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("short_runs")]
@@ -112,7 +113,16 @@ def test_pictures_of_a_merged_run_do_not_show_the_way_between_its_drives(
         draw(merged)
     long = [line for figure in shown for axes in figure.axes for line in axes.lines if len(line.get_xdata()) > 40]
     drawn += [np.column_stack([line.get_xdata(), line.get_ydata()]) for line in long]
-    assert len(drawn) >= 10
+    compared: list[Figure] = []
+    saved = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda *args, **more: compared.append(args[0]) or saved(*args, **more))
+    comparison.draw_runs(tmp_path / "compared.png", {"merged": merged})
+    drawn += [line.get_xydata() for figure in compared for axes in figure.axes for line in axes.lines]
+    page = top_view(merged, lambda _: (np.zeros((1, 3)), np.zeros(1, np.uint8)))
+    data = json.loads(re.findall(r'id="topview-data">(.*?)</script>', page, re.DOTALL)[0])
+    drawn += [np.array([path["x"], path["y"]], float).T for path in data["paths"]]
+    assert {len(values) for values in data["values"].values()} == {len(data["paths"][-1]["x"])}
+    assert len(drawn) >= 16
     assert {int(np.isnan(line).any(axis=1).sum()) for line in drawn} == {1}
 
 

@@ -86,10 +86,12 @@ def _same_data(one: FinishedRun, other: FinishedRun) -> bool:
 
 
 def _plot_group(above: Axes, error: Axes, runs: Mapping[str, FinishedRun], colors: Mapping[str, str]) -> None:
-    truth = next((run.reference for run in runs.values() if run.reference is not None), None)
-    common = truth if truth is not None else next(iter(runs.values())).result.trajectory
-    if truth is not None:
-        _plot_above(above, "ground truth", truth.T_world_lidar, figures.TRUTH, width=4.0)
+    first = next((run for run in runs.values() if run.reference is not None), next(iter(runs.values())))
+    scans = first.result.trajectory
+    common = scans if first.reference is None else first.reference
+    if first.reference is not None:
+        begun = begun_among(common.scan_index, scans.scan_index[first.result.begun])
+        _plot_above(above, "ground truth", parted(common.T_world_lidar, begun), figures.TRUTH, width=4.0)
     for name, run in runs.items():
         poses = run.result.trajectory.T_world_lidar
         rows = rows_of_same_scan(run.result.trajectory.scan_index, common.scan_index)

@@ -18,11 +18,12 @@ from matplotlib.figure import Figure
 
 from segslam.core import geometry
 from segslam.core.evaluation import pose_errors
-from segslam.core.trajectory import Poses
+from segslam.core.trajectory import begun_among, parted
 from segslam.core.types import (
     GROUND_LABELS,
     REJECTED_WEIGHT,
     CloudOf,
+    Indices,
     Labels,
     LoopAttempt,
     LoopClosure,
@@ -34,7 +35,7 @@ from segslam.core.types import (
 from segslam.output.accuracy import aligned_by
 from segslam.output.finished import FinishedRun
 from segslam.output.map.from_above import png
-from segslam.output.report.figures import paths_of, true_scans
+from segslam.output.report.figures import Line, paths_of, true_scans
 from segslam.slam.slam_result import outcome_text
 
 MOST_SCANS = 3000
@@ -66,7 +67,7 @@ def top_view(run: FinishedRun, cloud_of: CloudOf) -> str:
     """HTML of the view, with the clouds of some loops: those of `with_clouds`."""
     ids = {number for attempt in with_clouds(run) for number in attempt.candidate.pair}
     data = {
-        "paths": [_path(line.name, line.poses, line.color) for line in paths_of(run)],
+        "paths": [_path(line) for line in paths_of(run)],
         "values": _values(run),
         "loops": [_loop(run, attempt, ids) for attempt in run.result.attempts],
         "clouds": {str(number): _cloud(*cloud_of(number)) for number in sorted(ids)},
@@ -92,12 +93,12 @@ def packed_plotly() -> str:
     return base64.b64encode(gzip.compress(source, 9, mtime=0)).decode("ascii")
 
 
-def _path(name: str, poses: Poses, color: str) -> dict[str, Any]:
-    x, y = _thinned(poses[:, :3, 3])[:, :2].T
-    return {"name": name, "color": color, "x": _rounded(x), "y": _rounded(y)}
+def _path(line: Line) -> dict[str, Any]:
+    x, y = _thinned(line.poses[:, :2, 3], line.begun).T
+    return {"name": line.name, "color": line.color, "x": _rounded(x), "y": _rounded(y)}
 
 
-def _values(run: FinishedRun) -> dict[str, list[float]]:
+def _values(run: FinishedRun) -> dict[str, list[float | None]]:
     """What the trajectory can be coloured by; the last of `paths_of` has the same scans."""
     trajectory = run.result.trajectory
     values = {
@@ -110,7 +111,7 @@ def _values(run: FinishedRun) -> dict[str, list[float]]:
         rows, truth = true
         aligned = aligned_by(trajectory.T_world_lidar[rows], truth, "se3")
         values["error (m)"] = pose_errors(aligned, truth).translation_m
-    return {name: _rounded(_thinned(of_scans)) for name, of_scans in values.items()}
+    return {name: _rounded(_thinned(of_scans, run.result.begun)) for name, of_scans in values.items()}
 
 
 def _loop(run: FinishedRun, attempt: LoopAttempt, ids: set[int]) -> dict[str, Any]:
@@ -143,12 +144,15 @@ def _cloud(points: Points, labels: Labels) -> str:
     return base64.b64encode(np.round(kept / STEP_M).astype("<i2").tobytes()).decode("ascii")
 
 
-def _thinned(rows: np.ndarray) -> np.ndarray:
-    return rows[:: 1 + (len(rows) - 1) // MOST_SCANS]
+def _thinned(rows: np.ndarray, begun: Indices) -> np.ndarray:
+    """Some of the rows (n, ...), with one of NaN where another drive begins."""
+    kept = np.arange(0, len(rows), 1 + (len(rows) - 1) // MOST_SCANS)
+    return parted(rows[kept], begun_among(kept, begun))
 
 
-def _rounded(values: np.ndarray, digits: int = 2) -> list[float]:
-    return [round(float(value), digits) for value in values]
+def _rounded(values: np.ndarray, digits: int = 2) -> list[float | None]:
+    """Rounded values; None for NaN, which JSON does not have."""
+    return [None if np.isnan(value) else round(float(value), digits) for value in values]
 
 
 def _spread(num: int, most: int) -> list[int]:

@@ -130,9 +130,11 @@ def _score_run(
     metrics |= figures if how.align == "se3" else accuracy(run.result, reference, align=how.align)
     matched, truth = matched_poses(run.result.trajectory, reference)
     if plot is not None:
+        from segslam.core.trajectory import begun_among, rows_of_same_scan
         from segslam.output.report.comparison import draw_scored
 
-        draw_scored(plot, matched, truth, align=how.align)
+        rows = rows_of_same_scan(run.result.trajectory.scan_index, reference.scan_index)
+        draw_scored(plot, matched, truth, align=how.align, begun=begun_among(rows[:, 0], run.result.begun))
     figures = scores(matched, truth, align=how.align, rpe_distance_m=how.rpe_distance) | metrics
     return figures, metrics if how.align == "se3" else {}
 

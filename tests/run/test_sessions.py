@@ -117,12 +117,13 @@ def test_pictures_of_a_merged_run_do_not_show_the_way_between_its_drives(
     saved = Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda *args, **more: compared.append(args[0]) or saved(*args, **more))
     comparison.draw_runs(tmp_path / "compared.png", {"merged": merged})
+    assert run("eval", merged.folder, "--plot", tmp_path / "scored.png") == 0
     drawn += [line.get_xydata() for figure in compared for axes in figure.axes for line in axes.lines]
     page = top_view(merged, lambda _: (np.zeros((1, 3)), np.zeros(1, np.uint8)))
     data = json.loads(re.findall(r'id="topview-data">(.*?)</script>', page, re.DOTALL)[0])
     drawn += [np.array([path["x"], path["y"]], float).T for path in data["paths"]]
     assert {len(values) for values in data["values"].values()} == {len(data["paths"][-1]["x"])}
-    assert len(drawn) >= 16
+    assert len(drawn) >= 19
     assert {int(np.isnan(line).any(axis=1).sum()) for line in drawn} == {1}
 
 

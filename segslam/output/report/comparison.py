@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from segslam.core.evaluation import Up, align_positions
 from segslam.core.trajectory import Poses, begun_among, parted, rows_of_same_scan
-from segslam.core.types import SegslamError
+from segslam.core.types import Indices, SegslamError
 from segslam.core.whole_files import check_target, whole_file
 from segslam.output.accuracy import AFTER, Align, aligned_by
 from segslam.output.finished import FinishedRun
@@ -30,15 +30,26 @@ def check_picture(file: Path) -> None:
     check_target(file)
 
 
-def draw_scored(file: Path, estimate: Poses, reference: Poses, *, align: Align = "se3", up: Up = "z") -> None:
-    """Draw matched poses in top view, aligned, and the error against travel; `up`: upward axis of the reference."""
+def draw_scored(
+    file: Path,
+    estimate: Poses,
+    reference: Poses,
+    *,
+    align: Align = "se3",
+    up: Up = "z",
+    begun: Indices | Sequence[int] = (),
+) -> None:
+    """Draw matched poses in top view, aligned, and the error against travel.
+
+    `up`: upward axis of the reference; `begun`: rows at which another drive begins.
+    """
     aligned = aligned_by(estimate, reference, align)
     with matplotlib.rc_context(figures.STYLE):
         figure = Figure(figsize=(12.8, 6.0), layout="constrained")
         above, error = figure.subplots(1, 2)
-        _plot_above(above, "reference", reference, figures.TRUTH, width=4.0, up=up)
-        _plot_above(above, "estimate", aligned, COLORS[0], up=up)
-        figures.plot_error(error, "estimate", aligned, reference, COLORS[0])
+        _plot_above(above, "reference", parted(reference, begun), figures.TRUTH, width=4.0, up=up)
+        _plot_above(above, "estimate", parted(aligned, begun), COLORS[0], up=up)
+        figures.plot_error(error, "estimate", aligned, reference, COLORS[0], begun)
         _finish(figure, [above], error, file, error_of=f"error {AFTER[align]}", up=up)
 
 

@@ -3,8 +3,9 @@
 A single registration may be wrong, because places repeat. Where the graph predicts the pose, the prior excludes such
 errors; after much drift, and across a break of the odometry, nothing does, and one wrong loop ruins the map. Such a
 loop, one that contradicts its prior, and one that is less probable than the user accepts, is closed only if several
-keyframes, along some metres of travel, are registered, their poses are consistent with the odometry between them, and
-all attempts there together make them probable: also those that were refused, and those that lead elsewhere.
+keyframes, along some metres of travel in both passes, are registered, their poses are consistent with the odometry
+between them, and all attempts there together make them probable: also those that were refused, and those that lead
+elsewhere.
 """
 
 import math
@@ -23,7 +24,7 @@ from segslam.graph.motions import PLACE_M
 from segslam.verification.score import MISLED, log_odds_of_all
 
 MIN_CONSISTENT = 3
-"""Chosen: number of registrations of keyframes that must be consistent, of more than one place."""
+"""Chosen: number of registrations of keyframes that must be consistent, of more than one place in both passes."""
 SHARES = (np.arange(50) + 0.5) / 50
 """Shares of pairs that a registration finds at the right pose; all are as probable, because each sensor has its own."""
 
@@ -39,7 +40,7 @@ class Confirmation:
         self._least_odds = log_odds_of_all(config.verify)
         self._waiting: list[Attempted] = []
         self._refused: list[tuple[tuple[int, int], float]] = []
-        """Pairs whose best pose was not probable enough, and its log odds."""
+        """Pairs whose best pose was not probable enough, and its log odds; a probable one may lead elsewhere."""
         self._closed: list[LoopClosure] = []
 
     def is_waiting(self, keyframe_id: int) -> bool:
@@ -52,7 +53,7 @@ class Confirmation:
         if isinstance(outcome, LoopClosure):
             self._closed.append(outcome)
         elif outcome.probability is not None:
-            self._refused.append((attempt.candidate.pair, log_odds(outcome.probability)))
+            self._refused.append((attempt.candidate.pair, min(log_odds(outcome.probability), 0.0)))
 
     def attempts(
         self, candidate: LoopCandidate, closure: LoopClosure, seconds: dict[str, float]
@@ -61,12 +62,14 @@ class Confirmation:
 
         If they confirm each other, the noise of an odometry that contradicts them is increased.
         """
-        waiting = self._near(closure.source_id)
-        is_consistent = self._are_consistent(closure, [other for _, other in waiting])
-        agreeing = list(compress(waiting, is_consistent))
-        sources = {closure.source_id, *(other.source_id for _, other in agreeing)}
-        if len(sources) < MIN_CONSISTENT or np.ptp(self._graph.travel_m[list(sources)]) < SAME_PLACE_M:
-            lacking = f"{len(sources) - 1} of {MIN_CONSISTENT - 1} earlier keyframes confirm it"
+        num_breaks = self._graph.num_breaks  # across a break, any two loops are consistent
+        near = self._near(closure.source_id)
+        waiting = [one for one in near if num_breaks[one[1].target_id] == num_breaks[closure.target_id]]
+        agreeing = list(compress(waiting, self._are_consistent(closure, [other for _, other in waiting])))
+        pairs = np.array([(one.source_id, one.target_id) for one in (closure, *(other for _, other in agreeing))])
+        num = len(np.unique(pairs[:, 0]))
+        if num < MIN_CONSISTENT or np.ptp(self._graph.travel_m[pairs], axis=0).min() < SAME_PLACE_M:
+            lacking = f"{num - 1} of {MIN_CONSISTENT - 1} earlier keyframes confirm it"
         else:
             together = self._log_odds(candidate, closure, [other for _, other in agreeing])
             lacking = f"other attempts contradict it: log odds {together:.1f}" if together < self._least_odds else ""

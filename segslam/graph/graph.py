@@ -214,6 +214,14 @@ class PoseGraph:
         """
         return consistent_pairs(self._kept_odometry(), list(map(self._edge, closures)), self._inlier_bound)
 
+    def agreeing_pairs(self, closures: Sequence[LoopClosure]) -> Pairs:
+        """(k, k) which two of these are consistent and are evidence for each other: no break is between their ends.
+
+        Across a break, any two are consistent.
+        """
+        part = self.num_breaks[np.array([closure.pair for closure in closures], dtype=np.int64).reshape(-1, 2)]
+        return self.consistent_pairs(closures) & (part[:, None] == part).all(axis=2)
+
     def multiply_odometry_noise(self, factor: float) -> None:
         """Increase the noise of odometry, from the next optimisation on, and of keyframes added later."""
         sigma_m, sigma_deg = factor * self._config.odometry_sigma_m, factor * self._config.odometry_sigma_deg

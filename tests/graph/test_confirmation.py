@@ -24,11 +24,13 @@ STEP_M = 2.0
 NUM = 200
 
 
-def drive() -> PoseGraph:
-    """Straight on."""
+def drive(breaks: Sequence[int] = ()) -> PoseGraph:
+    """Straight on, with unknown motions to some keyframes."""
     graph = PoseGraph(GraphConfig())
     for number in range(NUM):
-        graph.add_keyframe(number, geometry.transform(np.eye(3), [number * STEP_M, 0.0, 0.0]), number * STEP_M)
+        information = 1e-4 * np.eye(6) if number in breaks else None
+        at_m = number * STEP_M
+        graph.add_keyframe(number, geometry.transform(np.eye(3), [at_m, 0.0, 0.0]), at_m, information=information)
     return graph
 
 
@@ -37,25 +39,34 @@ COVARIANCE = np.diag([0.01, 0.01, 0.01, 1.0, 1.0, 1.0])
 
 
 def loop(
-    graph: PoseGraph, source_id: int, *, T_drift: Transform = STAYS, probability: float = 0.99
+    graph: PoseGraph,
+    source_id: int,
+    target_id: int | None = None,
+    *,
+    T_drift: Transform = STAYS,
+    probability: float = 0.99,
 ) -> tuple[LoopCandidate, LoopClosure]:
-    """A loop from this keyframe to one of the first; by default, it agrees with the odometry."""
-    T_prior = geometry.inverse(graph.T_world_keyframes[5]) @ graph.T_world_keyframes[source_id]
-    T_target_source = geometry.inverse(graph.T_world_keyframes[5]) @ T_drift @ graph.T_world_keyframes[source_id]
+    """A loop from this keyframe, by default to one of the first; by default, it agrees with the odometry."""
+    target_id = max(source_id - 185, 0) if target_id is None else target_id
+    T_prior = geometry.inverse(graph.T_world_keyframes[target_id]) @ graph.T_world_keyframes[source_id]
+    T_target_source = (
+        geometry.inverse(graph.T_world_keyframes[target_id]) @ T_drift @ graph.T_world_keyframes[source_id]
+    )
     registration = Registration(T_target_source, 20, 20, 0.1, np.eye(6) * 1e4)
     alignment = Alignment(registration, registration, 0.9, 0.1, 0.0, probability=probability)
-    return LoopCandidate(source_id, 5, T_prior, 0.0, COVARIANCE), LoopClosure.of(source_id, 5, alignment)
+    closure = LoopClosure.of(source_id, target_id, alignment)
+    return LoopCandidate(source_id, target_id, T_prior, 0.0, COVARIANCE), closure
 
 
-def attempts(confirmation: Confirmation, graph: PoseGraph, source_id: int, **kind: Any) -> Sequence[LoopAttempt]:
+def attempts(confirmation: Confirmation, graph: PoseGraph, *pair: int, **kind: Any) -> Sequence[LoopAttempt]:
     """What becomes of such a loop."""
-    return confirmation.attempts(*loop(graph, source_id, **kind), {})
+    return confirmation.attempts(*loop(graph, *pair, **kind), {})
 
 
-def refuse(confirmation: Confirmation, source_id: int, target_id: int) -> None:
-    """Note that the best pose between these two was improbable."""
+def refuse(confirmation: Confirmation, source_id: int, target_id: int, *, probability: float = 0.001) -> None:
+    """Note that the best pose between these two was not probable enough."""
     candidate = LoopCandidate(source_id, target_id, np.eye(4), 0.0)
-    confirmation.note(LoopAttempt(candidate, Rejected(RejectReason.AMBIGUOUS, "", probability=0.001), {}))
+    confirmation.note(LoopAttempt(candidate, Rejected(RejectReason.AMBIGUOUS, "", probability=probability), {}))
 
 
 def are_closed(found: Sequence[LoopAttempt]) -> bool:
@@ -73,6 +84,23 @@ def test_registrations_wait_for_others_that_are_near() -> None:
     assert are_closed(found), "a search that begins with the first keyframes again drops none"
     assert len(found) == MIN_CONSISTENT
     assert not confirmation.is_waiting(sources[-1]), "they are closed"
+
+
+@pytest.mark.parametrize(("targets", "are_confirmed"), [((5, 9, 12), True), ((5, 5, 5), False), ((5, 6, 5), False)])
+def test_loops_to_one_place_do_not_confirm_each_other(targets: tuple[int, ...], are_confirmed: bool) -> None:
+    graph = drive()
+    confirmation = Confirmation(graph, Config())
+    for source_id, target_id in zip((190, 194, 197), targets, strict=True):
+        found = attempts(confirmation, graph, source_id, target_id)
+    assert are_closed(found) is are_confirmed
+
+
+def test_loops_do_not_confirm_each_other_across_a_break_of_the_earlier_pass() -> None:
+    graph = drive(breaks=[11])
+    confirmation = Confirmation(graph, Config())
+    for source_id in (190, 194, 197, 198):
+        assert not are_closed(attempts(confirmation, graph, source_id))
+    assert are_closed(attempts(confirmation, graph, 199)), "three loops lead to the part after the break"
 
 
 def test_a_confirmation_leaves_those_that_wait_elsewhere() -> None:
@@ -124,6 +152,16 @@ def test_refused_attempts_count_within_a_stretch_of_the_drive(first_id: int, are
     for source_id in (190, 192, 193):
         found = attempts(confirmation, graph, source_id)
     assert are_closed(found) is are_probable
+
+
+def test_refused_attempts_never_count_for_loops() -> None:
+    graph = drive()
+    confirmation = Confirmation(graph, Config())
+    for number in range(12):
+        refuse(confirmation, 190 + number % 3, 5 + number // 6, probability=0.8)
+    for source_id in (190, 192, 193):
+        found = attempts(confirmation, graph, source_id, T_drift=DRIFT, probability=0.95)
+    assert not are_closed(found)
 
 
 def test_loops_that_lead_elsewhere_count_against_others_nearby() -> None:

@@ -1,7 +1,7 @@
 """Relative pose of two sessions: keyframes of one are located in the other, and the largest consistent set is used.
 
-Two located keyframes are consistent if they and the odometry between them, in both sessions, form a loop within the
-noise (`segslam.graph.closure_pairs`). A wrong location is consistent with few others.
+Two located keyframes are consistent if they and the odometry between them, in both sessions and without a break, form
+a loop within the noise (`segslam.graph.closure_pairs`). A wrong location is consistent with few others.
 """
 
 from collections import deque
@@ -71,7 +71,7 @@ def find_session(
             found.append(LoopClosure.of(keyframe_id, place.keyframe_id, place.alignment))
             if likely is not None:  # a place that is shared is so for some metres, perhaps for a few keyframes only
                 queue.extendleft((keyframe_id - 1, keyframe_id + 1))
-            consistent = largest_consistent(graph.consistent_pairs([shifted(one, first_id, 0) for one in found]))
+            consistent = largest_consistent(graph.agreeing_pairs([shifted(one, first_id, 0) for one in found]))
             kept = [one for one, keep in zip(found, consistent, strict=True) if keep]
         if _is_enough(kept, session) or (likely is not None and not found and num_tried == MOST_FAILED):
             break

@@ -3,9 +3,9 @@
 A single registration may be wrong, because places repeat. Where the graph predicts the pose, the prior excludes such
 errors; after much drift, and across a break of the odometry, nothing does, and one wrong loop ruins the map. Such a
 loop, one that contradicts its prior, and one that is less probable than the user accepts, is closed only if several
-keyframes, along some metres of travel in both passes, are registered, their poses are consistent with the odometry
-between them, and all attempts there together make them probable: also those that were refused, and those that lead
-elsewhere.
+keyframes, along some metres of travel, are registered, their poses are consistent with the odometry between them, and
+all attempts there together make them probable: also those that were refused, and those that lead elsewhere. Across a
+break the earlier keyframes are along some metres, too: otherwise all loops may have the error of one scan.
 """
 
 import math
@@ -24,7 +24,7 @@ from segslam.graph.motions import PLACE_M
 from segslam.verification.score import MISLED, log_odds_of_all
 
 MIN_CONSISTENT = 3
-"""Chosen: number of registrations of keyframes that must be consistent, of more than one place in both passes."""
+"""Chosen: number of registrations of keyframes that must be consistent, of more than one place."""
 SHARES = (np.arange(50) + 0.5) / 50
 """Shares of pairs that a registration finds at the right pose; all are as probable, because each sensor has its own."""
 
@@ -62,13 +62,15 @@ class Confirmation:
 
         If they confirm each other, the noise of an odometry that contradicts them is increased.
         """
-        num_breaks = self._graph.num_breaks  # across a break, any two loops are consistent
+        part = self._graph.num_breaks  # across a break, any two loops are consistent
         near = self._near(closure.source_id)
-        waiting = [one for one in near if num_breaks[one[1].target_id] == num_breaks[closure.target_id]]
+        waiting = [one for one in near if part[one[1].target_id] == part[closure.target_id]]
         agreeing = list(compress(waiting, self._are_consistent(closure, [other for _, other in waiting])))
-        pairs = np.array([(one.source_id, one.target_id) for one in (closure, *(other for _, other in agreeing))])
-        num = len(np.unique(pairs[:, 0]))
-        if num < MIN_CONSISTENT or np.ptp(self._graph.travel_m[pairs], axis=0).min() < SAME_PLACE_M:
+        ends = np.array([(one.source_id, one.target_id) for one in (closure, *(other for _, other in agreeing))])
+        num = len(np.unique(ends[:, 0]))
+        if part[closure.source_id] == part[closure.target_id]:  # else only the loops show where the targets are
+            ends = ends[:, :1]
+        if num < MIN_CONSISTENT or np.ptp(self._graph.travel_m[ends], axis=0).min() < SAME_PLACE_M:
             lacking = f"{num - 1} of {MIN_CONSISTENT - 1} earlier keyframes confirm it"
         else:
             together = self._log_odds(candidate, closure, [other for _, other in agreeing])

@@ -86,9 +86,14 @@ def test_registrations_wait_for_others_that_are_near() -> None:
     assert not confirmation.is_waiting(sources[-1]), "they are closed"
 
 
-@pytest.mark.parametrize(("targets", "are_confirmed"), [((5, 9, 12), True), ((5, 5, 5), False), ((5, 6, 5), False)])
-def test_loops_to_one_place_do_not_confirm_each_other(targets: tuple[int, ...], are_confirmed: bool) -> None:
-    graph = drive()
+@pytest.mark.parametrize(
+    ("targets", "breaks", "are_confirmed"),
+    [((5, 9, 12), [100], True), ((5, 5, 5), [100], False), ((5, 6, 5), [100], False), ((5, 5, 5), [], True)],
+)
+def test_loops_to_one_place_do_not_confirm_each_other_across_a_break(
+    targets: tuple[int, ...], breaks: list[int], are_confirmed: bool
+) -> None:
+    graph = drive(breaks)
     confirmation = Confirmation(graph, Config())
     for source_id, target_id in zip((190, 194, 197), targets, strict=True):
         found = attempts(confirmation, graph, source_id, target_id)

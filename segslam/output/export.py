@@ -14,14 +14,14 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from segslam.core.config import MapConfig, load_config
-from segslam.core.types import Indices, Keyframe, Mask, MotionState, SegslamError, Step, Transform
+from segslam.core.types import Indices, Keyframe, SegslamError, Transform
 from segslam.core.whole_files import all_expanded, cannot_write, expanded, whole_file
-from segslam.output.finished import read_corrections
-from segslam.output.folder import PLACE_ON_GLOBE, read_localised
+from segslam.output.finished import read_corrections, read_result
+from segslam.output.folder import PLACE_ON_GLOBE
 from segslam.output.log import RunLog, read_log
 from segslam.output.map.write import check_files, write_map
 from segslam.slam.adjustment import Progress, no_progress
-from segslam.slam.slam_result import TRUSTED_M
+from segslam.slam.slam_result import SlamResult
 
 if TYPE_CHECKING:
     from segslam.gnss import Origin
@@ -72,62 +72,43 @@ def write_maps(
         raise SegslamError(f"{twice[0]}: given twice; give each file once")
     of_map = [file for file in files if file.name != BEFORE_AFTER and not is_track(file)]
     check_files(of_map, origin=origin, others=KINDS)
+    result = read_result(log)
     with ExitStack() as complete:  # moves each file to its name at the end, after a failure none
         for file in files:
             if file.name == BEFORE_AFTER:
                 complete.enter_context(whole_file(file)).write_bytes(draw_before_after(folder))
             elif is_track(file):
-                rows, stamp_ns = np.flatnonzero(_in_map(log)), log.final()[1].stamp_ns
+                rows = np.flatnonzero(result.localised())
                 there = globe and replace(globe, T_enu_lidar=globe.T_enu_lidar[rows])
-                name, cuts = folder.resolve().name, _cuts(log, rows)
-                content = track(file, there, stamp_ns[rows], name=name, cuts=cuts)
+                cuts = (np.flatnonzero((np.diff(rows) > 1) | np.isin(rows[1:], result.begun)) + 1).tolist()
+                content = track(file, there, result.trajectory.stamp_ns[rows], name=folder.resolve().name, cuts=cuts)
                 complete.enter_context(whole_file(file)).write_bytes(content)
         if not of_map:
             return {"map_seconds": perf_counter() - started}
         try:
-            placed, begun = _placed(log, globe, show), {step.scan_index for step in _begun(log).values()}
+            begun = set(result.trajectory.scan_index[result.begun].tolist())
+            placed = _placed(log, result, globe, show)
             made = write_map(placed, of_map, config=config, origin=origin, begun=begun, show=show)
         except OSError as error:
             raise cannot_write(of_map[0], error) from error
     return {**made, "map_seconds": perf_counter() - started}
 
 
-def _placed(log: RunLog, globe: "Globe | None", show: Progress) -> Iterator[tuple[Keyframe, Transform]]:
+def _placed(
+    log: RunLog, result: SlamResult, globe: "Globe | None", show: Progress
+) -> Iterator[tuple[Keyframe, Transform]]:
     """Each keyframe of known pose, in the world or on the globe, its points corrected as in the adjustment."""
-    estimate, _ = log.final()
-    in_map = _in_map(log)
-    corrections = read_corrections(log, len(estimate.T_world_keyframe))
-    num_gathered = 0
-    for row, step in enumerate(show(log.steps(), log.num_steps(), "gather")):
-        if step.keyframe is None:
-            continue
-        num_gathered += 1
-        if in_map[row]:
-            points = corrections[step.keyframe.id](step.keyframe.points)
-            T_world_keyframe = estimate.T_world_keyframe[step.keyframe.id] if globe is None else globe.T_enu_lidar[row]
-            yield replace(step.keyframe, points=points), T_world_keyframe
-    if num_gathered < len(estimate.T_world_keyframe):
-        readable = f"only {num_gathered} of its {len(estimate.T_world_keyframe)} keyframes are readable"
+    num, num_read = len(result.estimate.T_world_keyframe), len(result.keyframe_rows)
+    if num_read < num:
+        readable = f"only {num_read} of its {num} keyframes are readable"
         raise SegslamError(f"{log.path}: damaged, {readable}; the map is not written. Map the data again, or replay it")
-
-
-def _in_map(log: RunLog) -> Mask:
-    """(n,) whether the pose of each scan is known: of a run localised in a map, where it is."""
-    num_scans = len(log.final()[1])
-    from_map_m = read_localised(log.path.parent, num_scans)
-    return np.ones(num_scans, dtype=bool) if from_map_m is None else from_map_m <= TRUSTED_M
-
-
-def _cuts(log: RunLog, rows: Indices) -> list[int]:
-    """The places among the scans `rows` where another drive of a merged run begins, or scans are missing."""
-    cuts: list[int] = (np.flatnonzero((np.diff(rows) > 1) | np.isin(rows[1:], list(_begun(log)))) + 1).tolist()
-    return cuts
-
-
-def _begun(log: RunLog) -> dict[int, Step]:
-    """The scans with which another drive of a merged run begins, by row."""
-    steps = enumerate(log.steps(clouds=False))
-    return {row: step for row, step in steps if step.motion is not None and step.motion.state is MotionState.BEGUN}
+    corrections, localised = read_corrections(log, result), result.localised()
+    for row, step in enumerate(show(log.steps(), log.num_steps(), "gather")):
+        if step.keyframe is not None and localised[row]:
+            number = step.keyframe.id
+            points = corrections[number](step.keyframe.points)
+            placed = result.estimate.T_world_keyframe[number] if globe is None else globe.T_enu_lidar[row]
+            yield replace(step.keyframe, points=points), placed
 
 
 def is_track(file: Path) -> bool:

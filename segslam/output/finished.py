@@ -63,14 +63,15 @@ def read_run(folder: str | Path) -> FinishedRun:
         what = "not a run" if folder.exists() else "no such file or folder"
         raise SegslamError(f"{folder}: {what}; give a folder made by `segslam map --out`")
     log = read_log(folder)
-    result = _result(log)
+    result = read_result(log)
+    if len(result.odometry) < len(result.trajectory):
+        left = f"only {len(result.odometry)} of its {len(result.trajectory)} steps are readable"
+        raise SegslamError(f"{log.path}: damaged, {left}; replay it, or map the data again")
     return FinishedRun(
         folder=folder,
         dataset=log.run.get("dataset", ""),
         config=log.config,
-        result=replace(
-            result, from_map_m=read_localised(folder, len(result.trajectory)), alone=read_alone(folder, result.odometry)
-        ),
+        result=replace(result, alone=read_alone(folder, result.odometry)),
         reference=log.reference(),
         T_camera_lidar=log.T_camera_lidar,
         metrics=read_metrics(folder),
@@ -142,7 +143,11 @@ def _check_length(file: Path, num_poses: int, run: FinishedRun) -> None:
         )
 
 
-def _result(log: RunLog) -> SlamResult:
+def read_result(log: RunLog) -> SlamResult:
+    """The result of a run, but for `alone` and `adjusted`; of a damaged log, odometry and loops of readable steps only.
+
+    Raises SegslamError if the run did not finish.
+    """
     estimate, trajectory = log.final()
     T_odom_lidar, keyframe_rows = [], []
     attempts: list[LoopAttempt] = []
@@ -153,21 +158,18 @@ def _result(log: RunLog) -> SlamResult:
         motions += [step.motion] if step.motion else []
         if step.keyframe is not None:
             keyframe_rows.append(row)
-    if len(T_odom_lidar) < len(trajectory):
-        left = f"only {len(T_odom_lidar)} of its {len(trajectory)} steps are readable"
-        raise SegslamError(f"{log.path}: damaged, {left}; replay it, or map the data again")
-    late = log.late_loops()
-    odometry = Trajectory(trajectory.scan_index, trajectory.stamp_ns, np.array(T_odom_lidar))
-    return SlamResult(
-        trajectory, odometry, estimate, np.array(keyframe_rows), (*attempts, *late), tuple(motions), len(late)
-    )
+    late, num = log.late_loops(), len(T_odom_lidar)
+    odometry = Trajectory(trajectory.scan_index[:num], trajectory.stamp_ns[:num], np.array(T_odom_lidar))
+    from_map_m = read_localised(log.path.parent, len(trajectory))
+    attempts += late
+    rows = np.array(keyframe_rows)
+    return SlamResult(trajectory, odometry, estimate, rows, tuple(attempts), tuple(motions), len(late), from_map_m)
 
 
-def read_corrections(log: RunLog, num_keyframes: int) -> list[Correction]:
-    """The corrections of the points of the keyframes, by the adjustment of the run. Raises as `read_run`."""
+def read_corrections(log: RunLog, result: SlamResult) -> list[Correction]:
+    """The corrections of the points of the keyframes, by the adjustment of the run."""
     adjustment = log.adjustment()
     if adjustment is None or adjustment.sweep is None:
-        return [Correction(0.0 if adjustment is None else adjustment.correction_deg)] * num_keyframes
-    result = _result(log)
+        return [Correction(0.0 if adjustment is None else adjustment.correction_deg)] * len(result.keyframe_rows)
     velocities = velocities_of(result.odometry, result.keyframe_rows, result.motions)
     return corrections_of(adjustment.correction_deg, adjustment.sweep, velocities)

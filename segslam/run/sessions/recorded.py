@@ -83,7 +83,7 @@ class Session:
 def known_of(sessions: Sequence[Session], kept: Kept = nothing_kept) -> Known:
     """The results of the sessions' own adjustments, for all of them together."""
     poses = np.concatenate([session.T_world_keyframe for session in sessions])
-    corrections = [one for each in sessions for one in read_corrections(each.log, len(each.travel_m))]
+    corrections = [one for each in sessions for one in read_corrections(each.log, each.run.result)]
     adjustments = [session.log.adjustment() for session in sessions]
     sweeps = [None if one is None else one.sweep for one in adjustments]
     return Known(poses, corrections, _angle(sessions), common_sweep(sweeps), kept)

@@ -1,4 +1,4 @@
-"""Topics, channels, frames and metadata of a log, and the version of this format."""
+"""Topics, channels, frames and metadata of a log, which docs/files.md describes, and the version of this format."""
 
 import json
 import os
@@ -29,64 +29,32 @@ VERSION = 1
 """Increased whenever readers of the previous version would misread a log."""
 
 STEP = "/step"
-"""segslam.Step (JSON): a step without the fields in `records.BULK`; the last message of each step."""
 ESTIMATE = "/estimate"
-"""segslam.Estimate (JSON): result of an optimisation, and the keyframes of the /trajectory before it. Written after
-every optimisation; in a long run with many loops, after every second or third."""
 MEMORY = "/memory"
-"""segslam.Memory (JSON): `rss_mb`, memory of the process at each step, if known."""
 RESULT = "/result"
-"""segslam.Result (JSON): the pose of every scan; once, after the last step and the last estimate."""
 LATE_LOOPS = "/late_loops"
-"""segslam.LateLoops (JSON): loops tried after the last scan; once, after the last estimate; missing if none."""
 ADJUSTMENT = "/adjustment"
-"""segslam.Adjustment (JSON): the adjustment of the whole map; once, before the result; missing if none."""
 REFERENCE = "/reference"
-"""segslam.Reference (JSON): the true poses of the scans, if known; before the first step."""
 TRANSFORMS = "/tf"
-"""foxglove.FrameTransform: lidar in odom at every scan, odom in world after every optimisation."""
 KEYFRAME = "/keyframe"
-"""segslam.KeyframePoints (protobuf): all points of the step's keyframe, for replay. See `records`."""
 POINTS = "/points"
-"""foxglove.PointCloud: a subset of each keyframe's points in the lidar frame, with labels and colours, for display."""
 MAP = "/map"
-"""foxglove.PointCloud: a subset of all points in world, by the last estimate; once, before the result."""
 ODOMETRY = "/odometry"
-"""foxglove.PosesInFrame: the keyframes by odometry alone; world and odom coincide at the start."""
 TRAJECTORY = "/trajectory"
-"""foxglove.PosesInFrame: the keyframes in world, with each /estimate; between them, as often as /odometry, by the last
-estimate and the odometry since."""
 TRAJECTORY_BEFORE = "/trajectory_before"
-"""foxglove.PosesInFrame: the keyframes in world before the adjustment of the whole map; once, if there was one."""
 GROUND_TRUTH = "/ground_truth"
-"""foxglove.PosesInFrame: the true poses in world, moved to start at the origin of odom."""
-ACCEPTED = "/loops/accepted"
-REJECTED = "/loops/rejected"
-"""foxglove.SceneUpdate: a line between the keyframes of each loop candidate; a click shows the outcome."""
+ACCEPTED, REJECTED = "/loops/accepted", "/loops/rejected"
 LOG = "/log"
-"""foxglove.Log: skipped scans, repairs and breaks of the odometry, accepted loops, in words."""
 GRAPH = "/graph"
-"""foxglove.SceneUpdate: all closures, as often as /estimate; green: full weight, red: rejected by the optimiser."""
-
 FIXES, POSITIONS = "/gnss/fixes", "/gnss/positions"
-"""foxglove.LocationFix: position fixes within the drive, and the position of every scan; behind the result, in logs of
-georeferenced runs. See `locations`."""
-
 WORLD, ODOM, LIDAR, ANTENNA = "world", "odom", "lidar", "antenna"
 """Frames."""
 
 RUN_METADATA = "segslam"
-"""Metadata record: schema_version, dataset, python, platform, started (UTC), command, processor, and T_camera_lidar
-(JSON) for KITTI."""
 CONFIG_METADATA = "segslam.config"
-"""Metadata record: the effective settings under the key `yaml`."""
 OPTIONS_METADATA = "segslam.options"
-"""Metadata record: options beside the settings, such as the source of the labels; empty for a replay."""
 PACKAGES_METADATA = "segslam.packages"
-"""Metadata record: package -> version."""
-
 CHECK_METADATA = "segslam.check"
-"""Metadata record: `crc32`, the checksum of the other records, because MCAP has none; missing in older logs."""
 PROTOBUF_TOPICS: dict[str, Any] = {
     TRANSFORMS: FrameTransform,
     KEYFRAME: KeyframePoints,

@@ -88,8 +88,7 @@ def georeference(run: Annotated[Path, "Folder of a finished run."], *, gnss: Gns
     """
     check_exists(run, "give the folder of a finished run")
     terminal.announce(f"georeference: reading {run}")
-    from segslam.output.folder import folder_of
-    from segslam.output.georeferenced import ENU, FILE, FIXES, GEODETIC
+    from segslam.output.folder import PLACE_FILES, PLACE_ON_GLOBE, folder_of
     from segslam.output.log import read_log
     from segslam.output.report import write_report
 
@@ -102,6 +101,6 @@ def georeference(run: Annotated[Path, "Folder of a finished run."], *, gnss: Gns
     placed = place(folder)
     write_report(folder)
     if terminal.json:
-        print((folder / FILE).read_text(encoding="utf-8").rstrip(), flush=True)
+        print((folder / PLACE_ON_GLOBE).read_text(encoding="utf-8").rstrip(), flush=True)
     else:
-        terminal.say(f"{placed}\nresults in {folder}: {', '.join((FILE, FIXES, GEODETIC, ENU))}")
+        terminal.say(f"{placed}\nresults in {folder}: {', '.join(PLACE_FILES)}")

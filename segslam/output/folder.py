@@ -34,6 +34,7 @@ LOOP_COLUMNS = (
 )
 LOG = "log.mcap"
 PLACE_ON_GLOBE = "georeference.json"
+PLACE_FILES = (PLACE_ON_GLOBE, "gnss.csv", "poses_geodetic.csv", "poses_enu_tum.txt")
 ADJUSTED_GRAPH = "adjusted.g2o"
 """All edges of the last estimate, with the information with which they act."""
 ALONE, ALONE_FILES = "kiss_icp", ("kiss_icp_tum.txt", "kiss_icp_kitti.txt")
@@ -94,12 +95,6 @@ def write_poses(
         poses = camera_from_lidar(poses, T_camera_lidar)
     with whole_file(folder / f"{name}_kitti.txt") as part:
         write_kitti(part, poses)
-
-
-def remove_alone(folder: Path) -> None:
-    """Remove the files of KISS-ICP alone, whose state is lost when a run is resumed."""
-    for name in ALONE_FILES:
-        (folder / name).unlink(missing_ok=True)
 
 
 def copy_alone(source: Path, target: Path) -> None:

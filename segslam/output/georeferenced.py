@@ -23,13 +23,13 @@ from segslam.gnss.geodesy import Geodetic
 from segslam.gnss.reading import read_fixes
 from segslam.graph.g2o import read_g2o
 from segslam.output.finished import FinishedRun, read_run
-from segslam.output.folder import ADJUSTED_GRAPH, PLACE_ON_GLOBE, folder_of, log_of, room_for, write_csv, write_metrics
+from segslam.output.folder import ADJUSTED_GRAPH, PLACE_FILES, folder_of, log_of, room_for, write_csv, write_metrics
 from segslam.output.log import schema
 from segslam.output.log.locations import Locations, write_locations
 
 logger = logging.getLogger(__name__)
 
-FILE, FIXES, GEODETIC, ENU = PLACE_ON_GLOBE, "gnss.csv", "poses_geodetic.csv", "poses_enu_tum.txt"
+FILE, FIXES, GEODETIC, ENU = PLACE_FILES
 PLACE = ("datum", "latitude_deg", "longitude_deg", "height_m", "epsg", "T_enu_map", "sigma")
 """What a run localised in the map takes over from `FILE`."""
 SIGMAS = ("east_m", "north_m", "up_m")
@@ -94,12 +94,6 @@ def not_damaged(file: Path) -> Iterator[None]:
         yield
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise SegslamError(f"{file}: damaged ({error!r}); run `segslam georeference` again") from error
-
-
-def remove_place(folder: Path) -> None:
-    """Remove the files with the place of a run on the globe, which are not of the scans that are added to it."""
-    for name in (FILE, FIXES, GEODETIC, ENU):
-        (folder / name).unlink(missing_ok=True)
 
 
 def georeference_if_possible(

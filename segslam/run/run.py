@@ -29,10 +29,11 @@ from segslam.output.finished import read_metrics
 from segslam.output.folder import (
     ADJUSTED_GRAPH,
     ALONE,
+    ALONE_FILES,
     LOG,
+    PLACE_FILES,
     UNFINISHED,
     read_alone,
-    remove_alone,
     room_for,
     write_localised,
     write_loops,
@@ -158,12 +159,10 @@ class Run:
                 raise _other_data(recorded.path, f"has scan {scan.index} at {stamp_ns} ns, the data {scan.stamp_ns} ns")
             return scan
 
-        from segslam.output.georeferenced import remove_place
-
         self._slam.resume(scan_of)
         self._log.move(recorded.path)
-        remove_alone(self.folder)
-        remove_place(self.folder)
+        for name in (*ALONE_FILES, *PLACE_FILES):  # the state of KISS-ICP is lost, the place that of fewer scans
+            (self.folder / name).unlink(missing_ok=True)
         self.num_scans_resumed = len(taken)
         self._started_mapping = perf_counter()
         self._next_row = taken[-1][0] + 1 if taken else 0

@@ -209,13 +209,13 @@ class GnssOptions:
         """
         if self.gnss is None:
             return None
+        from segslam.gnss.fixes import make_fixes
         from segslam.output.georeferenced import georeference_if_possible
         from segslam.run.live.ros import FixTopic
 
         name, topic = self.gnss, stack.enter_context(FixTopic(self.gnss))
-        return lambda folder: georeference_if_possible(
-            folder, name, topic.rows.copy(), use=self.gnss_use, offset_s=self.gnss_offset
-        )
+        options: Any = {"use": self.gnss_use, "offset_s": self.gnss_offset}
+        return lambda folder: georeference_if_possible(folder, lambda: make_fixes(name, topic.rows.copy()), **options)
 
     def recorded(self) -> dict[str, str]:
         """The options as the log of a run keeps them, for `resume`."""

@@ -46,6 +46,15 @@ def read_text(path: Path, content: str, remedy: str) -> str:
         raise SegslamError(f"{unreadable(path, content, error)}; {remedy}") from error
 
 
+@contextmanager
+def unless_damaged(file: Path, remedy: str) -> Iterator[None]:
+    """Context manager in which a file is read. Raises SegslamError, with the remedy, if that fails."""
+    try:
+        yield
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError) as error:
+        raise SegslamError(f"{file}: damaged ({error!r}); {remedy}") from error
+
+
 def check_target(file: Path) -> None:
     """Raises SegslamError for a file that cannot be written: its folder is missing, or it is no regular file."""
     try:

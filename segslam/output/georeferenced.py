@@ -3,10 +3,10 @@
 import csv
 import json
 import logging
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,10 @@ from scipy.spatial import cKDTree
 
 from segslam.core.trajectory import Poses, corrected_poses, read_poses, write_tum
 from segslam.core.types import SegslamError
-from segslam.core.whole_files import expanded, whole_file, write_whole
+from segslam.core.whole_files import expanded, unless_damaged, whole_file, write_whole
 from segslam.gnss import Drive, Fixes, Georeference, Origin, Use, geodetic_from_enu, utm_epsg
 from segslam.gnss import georeference as georeference_drive
-from segslam.gnss.fixes import DUPLICATE, NO_FIX, NOT_FINITE, Row, make_fixes
+from segslam.gnss.fixes import DUPLICATE, NO_FIX, NOT_FINITE, Row
 from segslam.gnss.geodesy import Geodetic
 from segslam.gnss.reading import read_fixes
 from segslam.graph.g2o import read_g2o
@@ -34,6 +34,7 @@ PLACE = ("datum", "latitude_deg", "longitude_deg", "height_m", "epsg", "T_enu_ma
 """What a run localised in the map takes over from `FILE`."""
 SIGMAS = ("east_m", "north_m", "up_m")
 DEGREES_AND_HEIGHT = ("latitude_deg", "longitude_deg", "height_m")
+not_damaged = partial(unless_damaged, remedy="run `segslam georeference` again")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,23 +88,14 @@ def read_globe(folder: Path) -> Globe | None:
     return Globe(origin, read_poses(folder / ENU, format="tum").T_a_b)
 
 
-@contextmanager
-def not_damaged(file: Path) -> Iterator[None]:
-    """Context manager that raises SegslamError if the file cannot be read within it, or has other content."""
-    try:
-        yield
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise SegslamError(f"{file}: damaged ({error!r}); run `segslam georeference` again") from error
-
-
 def georeference_if_possible(
-    folder: Path, source: str, rows: Sequence[Row], *, use: Use | str = Use.FUSE, offset_s: float = 0.0
+    folder: Path, fixes: Fixes | Callable[[], Fixes], *, name: str = "", use: str = Use.FUSE, offset_s: float = 0.0
 ) -> str:
-    """As `georeference`, with fixes called `source` in messages; returns what was found. Failures are warnings."""
+    """As `georeference` of a run with another `name` in messages; returns what was found. Failures are warnings."""
     try:
-        return summary(georeference(folder, make_fixes(source, rows), use=use, offset_s=offset_s))
+        return summary(georeference(folder, fixes() if callable(fixes) else fixes, use=use, offset_s=offset_s))
     except SegslamError as error:
-        logger.warning("%s: has no place on the globe: %s", folder, error)
+        logger.warning("%s: has no place on the globe: %s", name or folder, error)
         return ""
 
 
@@ -138,18 +130,14 @@ def take_over(run: str | Path, map_run: str | Path) -> bool:
     return True
 
 
-def use_of(folder: Path) -> str:
-    """How the fixes of a run were used; empty without fixes. Raises SegslamError for a damaged file."""
-    file = folder / FILE
-    with not_damaged(file):
-        return str(json.loads(file.read_text(encoding="utf-8")).get("use", "")) if file.exists() else ""
+def recorded_fixes(folder: Path, *, stamp_shift_ns: int = 0) -> tuple[list[Row], str]:
+    """The fixes of a run, in the clock of its scans, shifted, and how they were used; without fixes, both are empty.
 
-
-def recorded_fixes(folder: Path, *, stamp_shift_ns: int = 0) -> list[Row]:
-    """The fixes of a run, if any, in the clock of its scans, shifted. Raises SegslamError for damaged files."""
+    Raises SegslamError for damaged files.
+    """
     file = folder / FIXES
     if not file.exists():
-        return []
+        return [], ""
     with not_damaged(file):
         values = json.loads((folder / FILE).read_text(encoding="utf-8"))
         offset_ns = round(1e9 * (values["given_offset_s"] + values["clock_offset_s"])) + stamp_shift_ns
@@ -159,7 +147,7 @@ def recorded_fixes(folder: Path, *, stamp_shift_ns: int = 0) -> list[Row]:
         for row in rows:
             latitude, longitude, height_m = (float(row[name] or "nan") for name in DEGREES_AND_HEIGHT)
             found.append(Row(int(row["stamp_ns"]) + offset_ns, latitude, longitude, height_m))
-        return found
+        return found, str(values.get("use", ""))
 
 
 def _write(run: FinishedRun, placed: Georeference, use: Use, offset_s: float) -> None:

@@ -6,21 +6,23 @@ With the alignments, a component is adjusted again quickly.
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from segslam.core import whole_files
 from segslam.core.config import RefineConfig
 from segslam.core.trajectory import Poses
-from segslam.core.types import SegslamError
 from segslam.output.log.records import codec
 from segslam.run.fleets.drives import key_of
 from segslam.slam.adjustment import Adjustment
 from segslam.slam.adjustment.alignment import Alignment
 from segslam.slam.adjustment.known import Compute, Guess
+
+unless_damaged = partial(whole_files.unless_damaged, remedy="remove it, and call `segslam fleet` again")
 
 Key = tuple[int, ...]
 """Keyframes of the target and of the source by their own drives, and the rounded initial guess."""
@@ -94,12 +96,3 @@ def read_kept(file: Path, kind: Any) -> Any:
     """Raises SegslamError, naming the file, if it is damaged."""
     with unless_damaged(file):
         return codec(kind).decode(json.loads(file.read_text(encoding="utf-8")), {})
-
-
-@contextmanager
-def unless_damaged(file: Path) -> Iterator[None]:
-    """Context manager in which a file is read that a fleet keeps. Raises SegslamError, naming it, if it is damaged."""
-    try:
-        yield
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError) as error:
-        raise SegslamError(f"{file}: damaged ({error!r}); remove it, and call `segslam fleet` again") from error

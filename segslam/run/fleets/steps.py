@@ -4,7 +4,6 @@ A step writes its result beside the final name and renames it when it is whole. 
 """
 
 import json
-import logging
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,11 +18,10 @@ import numpy as np
 from segslam.candidates import Places, PlaceSignature
 from segslam.core.config import Config, load_config
 from segslam.core.types import SegslamError, Trajectory
-from segslam.gnss.fixes import Fixes
 from segslam.gnss.reading import read_fixes
 from segslam.output.finished import read_metrics
 from segslam.output.folder import log_of, write_poses
-from segslam.output.georeferenced import georeference, summary
+from segslam.output.georeferenced import georeference_if_possible
 from segslam.output.log import read_log
 from segslam.run.fleets.drives import Drive, key_of
 from segslam.run.fleets.kept import Alignments, KeptAlignment, part_of, read_kept, unless_damaged, write_kept
@@ -35,7 +33,6 @@ from segslam.run.sessions.session_pose import Relation, find_session
 from segslam.scans import DataSource
 from segslam.scans.presets import SETTINGS, Preset, extent_m, preset, preset_for
 
-logger = logging.getLogger(__name__)
 RUNS, INDEX, PROPOSALS, PAIRS, ALIGNMENTS = "runs", "index", "proposals", "pairs", "alignments"
 KEY = "fleet.key"
 """File in a run folder of a fleet: the key that it was made with."""
@@ -93,19 +90,10 @@ def map_drive(fleet: Path, drive: Drive) -> Mapped:
     odometry = None
     if drive.odometry:
         odometry = given_odometry(Path(drive.odometry), open_scans(source, config), config.odometry)
-    place = None if fixes is None else partial(_georeference, drive.name, fixes)
+    place = None if fixes is None else partial(georeference_if_possible, fixes=fixes, name=drive.name)
     map_folder(source.data, part, config=config, odometry=odometry, place=place, **options)
     _made(part, folder, mapped.key)
     return mapped
-
-
-def _georeference(name: str, fixes: Fixes, part: Path) -> str:
-    """Place a mapped drive by its fixes; where they do not determine a place, the drive remains without."""
-    try:
-        return summary(georeference(part, fixes))
-    except SegslamError as error:
-        logger.warning("%s: has no place on the globe: %s", name, error)
-        return ""
 
 
 def _config(drive: Drive, source: DataSource) -> Config:

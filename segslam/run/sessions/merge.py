@@ -15,10 +15,10 @@ from segslam.core.config import Config, check_config
 from segslam.core.types import LoopAttempt, SegslamError, Step, Trajectory
 from segslam.core.whole_files import all_expanded, expanded
 from segslam.gnss import Use
-from segslam.gnss.fixes import Row
+from segslam.gnss.fixes import Row, make_fixes
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import new_folder
-from segslam.output.georeferenced import georeference_if_possible, recorded_fixes, use_of
+from segslam.output.georeferenced import georeference_if_possible, recorded_fixes
 from segslam.output.log import RunLog
 from segslam.run.locator import Locator
 from segslam.run.run import Run
@@ -115,11 +115,12 @@ class Merged:
         """
         rows, uses = list[Row](), set[str]()
         for session in self.sessions:
-            rows += recorded_fixes(session.run.folder, stamp_shift_ns=session.shift.stamp_ns)
-            uses |= {use} if (use := use_of(session.run.folder)) else set()
+            fixes, used = recorded_fixes(session.run.folder, stamp_shift_ns=session.shift.stamp_ns)
+            rows += fixes
+            uses |= {used} if used else set()
         source = " + ".join(session.name for session in self.sessions)
         use = Use.ALIGN if uses == {Use.ALIGN} else Use.FUSE
-        return georeference_if_possible(folder, source, rows, use=use) if rows else ""
+        return georeference_if_possible(folder, lambda: make_fixes(source, rows), use=use) if rows else ""
 
 
 def plan(

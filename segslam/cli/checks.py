@@ -129,12 +129,6 @@ def check_links(folder: Path) -> None:
             raise SegslamError(f"{file}: a link to {file.resolve()}, outside of the run; remove the link")
 
 
-def check_intensities(scans: "Dataset") -> None:
-    """Raises SegslamError if the first readable scan has no intensities."""
-    if first_usable(scans)[1].intensities is None:
-        raise SegslamError(f"map.color=intensity: {scans.name} has no intensities; use class or height")
-
-
 def log_to_resume(folder: Path) -> "RunLog":
     """The log of the run in a folder. Raises SegslamError if there is none, or the run is still in progress."""
     from segslam.output.folder import LOG
@@ -188,10 +182,9 @@ def has_results(recorded: "RunLog") -> bool:
 
 def is_finished(recorded: "RunLog", scans: "Dataset") -> bool:
     """True if the run has all its results, for all scans of the data set that can be read."""
-    result = recorded.result()
-    if result is None or not has_results(recorded):
+    if not has_results(recorded):
         return False
-    last = int(result[1].scan_index[-1])  # scans are read only if the last one is missing
+    last = int(recorded.final()[1].scan_index[-1])  # scans are read only if the last one is missing
     return last == int(scans.scan_index[-1]) or last == int(scans.scan_index[first_usable(scans, backwards=True)[0]])
 
 

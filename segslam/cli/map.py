@@ -12,7 +12,6 @@ import typer
 from segslam.cli.checks import (
     check_exists,
     check_free,
-    check_intensities,
     check_preset,
     check_same,
     check_scans,
@@ -25,7 +24,7 @@ from segslam.cli.checks import (
     why_not_resumed,
 )
 from segslam.cli.console import Terminal, how_to_go_on, print_json, say
-from segslam.cli.dry_run import found_in, lines
+from segslam.cli.dry_run import first_usable, found_in, lines
 from segslam.cli.ending import finish, is_interrupted, map_summary
 from segslam.cli.options import DataArgument, GnssOptions, RunOptions, RunOutput, ViewOption
 from segslam.cli.viewers import check_display, scene_in, serve_foxglove
@@ -172,8 +171,8 @@ def map_data(
     check_free(outside(map_files, folder), overwrite=output.overwrite or options.resume)
     source = options.source(data, options.labels, options.encoding)
     scans = open_scans(source, settings)
-    if settings.map.color == "intensity":
-        check_intensities(scans)
+    if settings.map.color == "intensity" and first_usable(scans)[1].intensities is None:
+        raise SegslamError(f"map.color=intensity: {scans.name} has no intensities; use class or height")
     choices = resume_options(source, odometry=options.odometry, map_files=map_names) | gnss.recorded()
     place = gnss.placing(data) or place
     choices |= {"in_map": str(in_map.expanduser().resolve())} if in_map else {}

@@ -21,6 +21,7 @@ from segslam.scans.kitti import read_calibration
 
 FileFormat = Literal["kitti", "tum", "csv"]
 Frame = Literal["camera", "lidar"]
+FORMATS: dict[str, FileFormat] = {".csv": "csv", ".tum": "tum", ".kitti": "kitti"}
 HEADER = "seconds,x,y,z,qx,qy,qz,qw"
 """First line of a CSV file: the columns of TUM format, with commas."""
 
@@ -51,7 +52,7 @@ def convert(
         T_camera_lidar = read_calibration(calib)
         moved = lidar_from_camera if to == "lidar" else camera_from_lidar
         poses = replace(poses, T_a_b=moved(poses.T_a_b, T_camera_lidar))
-    written_as = target_format or _format_of_name(target, poses)
+    written_as = target_format or FORMATS.get(target.suffix.lower(), "kitti" if poses.stamp_ns is None else "tum")
     with whole_file(target) as part:
         if written_as == "kitti":
             write_kitti(part, poses.T_a_b)
@@ -79,10 +80,3 @@ def _with_stamps(poses: PoseFile, source: Path, times: Path | None) -> PoseFile:
     if len(stamps) != len(poses):
         raise SegslamError(f"{times}: {len(stamps)} times, but {source} has {len(poses)} poses; give the times of it")
     return replace(poses, stamp_ns=stamps)
-
-
-def _format_of_name(target: Path, poses: PoseFile) -> FileFormat:
-    suffix = target.suffix.lower()
-    if suffix == ".csv":
-        return "csv"
-    return "tum" if suffix == ".tum" or (suffix != ".kitti" and poses.stamp_ns is not None) else "kitti"

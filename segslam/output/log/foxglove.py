@@ -112,8 +112,6 @@ def scene(entities: Iterable[SceneEntity], *, deleted: Iterable[str] = ()) -> Sc
 
 
 def _poses(T_frame_each: np.ndarray) -> list[Pose]:
-    if len(T_frame_each) == 0:
-        return []
     quaternions = ScipyRotation.from_matrix(T_frame_each[:, :3, :3]).as_quat().tolist()
     return [
         Pose(position=Vector3(x=tx, y=ty, z=tz), orientation=Quaternion(x=x, y=y, z=z, w=w))

@@ -27,9 +27,6 @@ if TYPE_CHECKING:
     from segslam.gnss import Origin
     from segslam.output.georeferenced import Globe
 
-DEGREES, METRES = 9, 3
-"""Decimals: 1e-9 degrees are 0.1 mm."""
-KML, GPX = "http://www.opengis.net/kml/2.2", "http://www.topografix.com/GPX/1/1"
 PROJECTOR_INFO = "map_projector_info.yaml"
 """Name of Autoware's file with the origin of a map."""
 Rows = list[list[float]]
@@ -129,8 +126,8 @@ def track(file: Path, globe: "Globe | None", stamp_ns: Indices, *, name: str, cu
     from segslam.gnss import geodetic_from_enu
 
     places = geodetic_from_enu(globe.T_enu_lidar[:, :3, 3], globe.origin)
-    rows = [
-        [round(longitude, DEGREES), round(latitude, DEGREES), round(height_m, METRES)]
+    rows = [  # 1e-9 degrees are 0.1 mm
+        [round(longitude, 9), round(latitude, 9), round(height_m, 3)]
         for latitude, longitude, height_m in places.tolist()
     ]
     return KINDS[file.suffix.lower()](rows, stamp_ns, name, cuts)
@@ -154,7 +151,7 @@ def _geojson(rows: Rows, stamp_ns: Indices, name: str, cuts: Sequence[int]) -> b
 
 def _kml(rows: Rows, stamp_ns: Indices, name: str, cuts: Sequence[int]) -> bytes:
     """OGC KML 2.2; heights are above the ellipsoid, so viewers draw the track on the ground."""
-    root = Xml.Element("kml", xmlns=KML)
+    root = Xml.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
     placemark = Xml.SubElement(Xml.SubElement(root, "Document"), "Placemark")
     Xml.SubElement(placemark, "name").text = name
     lines = Xml.SubElement(placemark, "MultiGeometry") if cuts else placemark
@@ -167,7 +164,7 @@ def _kml(rows: Rows, stamp_ns: Indices, name: str, cuts: Sequence[int]) -> bytes
 
 def _gpx(rows: Rows, stamp_ns: Indices, name: str, cuts: Sequence[int]) -> bytes:
     """GPX 1.1."""
-    root = Xml.Element("gpx", xmlns=GPX, version="1.1", creator="segslam")
+    root = Xml.Element("gpx", xmlns="http://www.topografix.com/GPX/1/1", version="1.1", creator="segslam")
     made = Xml.SubElement(root, "trk")
     Xml.SubElement(made, "name").text = name
     segment = Xml.SubElement(made, "trkseg")

@@ -25,7 +25,6 @@ MIN_OBSTACLE_VOXELS = 2
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205
 """Values of the mode `trinary` of map_server; 205 lies between its two thresholds."""
-OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
 OBSTACLE_M = (0.3, 2.0)
 """Chosen: heights above the ground where a voxel is an obstacle (m)."""
 GROUND_CELL_M = 2.0
@@ -63,8 +62,8 @@ class Grid:
             "resolution": TILE_M / self._cells,
             "origin": corner((self._west, self._south)).tolist(),
             "negate": 0,
-            "occupied_thresh": OCCUPIED_THRESHOLD,
-            "free_thresh": FREE_THRESHOLD,
+            "occupied_thresh": 0.65,
+            "free_thresh": 0.196,
         }
         self._file.write_text(yaml.safe_dump(about, sort_keys=False), encoding="utf-8")
 

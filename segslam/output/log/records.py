@@ -1,13 +1,7 @@
 """Lossless conversion of records to JSON with a JSON Schema, and back; compact messages for the points of keyframes.
 
-Python's JSON keeps all digits of a float64. Each record becomes an object with one key per field: `segslam.core.types`
-defines the format. Large fields are in separate binary messages and omitted from the JSON: see `BULK`. Foxglove's
-schema parser supports neither nested arrays nor alternatives, therefore:
-
-- an array of numbers is a flat list, row by row;
-- a field that is None is omitted, and a field with a default may be missing, as in logs of older versions;
-- one of several records is an object with one key, the name of the record;
-- a mapping with tuples as keys is a list of objects with a `key` and a `value`.
+docs/files.md describes both formats. Each record becomes an object with one key per field: `segslam.core.types` defines
+them. Large fields are in separate binary messages and omitted from the JSON: see `BULK`.
 """
 
 from collections.abc import Callable, Mapping
@@ -169,16 +163,7 @@ def _message_class() -> type[Message]:
 
 
 KeyframePoints = _message_class()
-"""All points of a keyframe, about 3 bytes per point: segslam.KeyframePoints (protobuf).
-
-Coordinates are integer multiples of `resolution_m`. Each is stored as the difference from the previous point, which is
-small because the points follow the beams; mapped to non-negative numbers (0, -1, 1, -2 become 0, 1, 2, 3); and split
-into planes: the lowest byte of every x, the second byte of every x, and so on to the fourth byte of every z. Planes of
-similar bytes compress well; interleaved floats do not.
-
-Intensities, if kept, take one byte each: 255 times the square root of their ratio to the maximum of the cloud. The
-noise of a photon count grows with its square root, so the relative loss is the same for weak and strong returns.
-"""
+"""All points of a keyframe, about 3 bytes per point: segslam.KeyframePoints (protobuf)."""
 
 
 def keyframe_points(keyframe: Keyframe, *, resolution_m: float) -> Message:

@@ -118,7 +118,7 @@ def _score_run(
         reference = true_poses(reference_file, run, format=how.format, max_difference_ns=limit_ns)
     if reference is None:
         raise SegslamError(f"{folder}: the data has no ground-truth poses; give a file with --reference")
-    figures = accuracy(run.result, reference)
+    figures = accuracy(run.result, reference, align=how.align)
     num_scans = len(run.result.trajectory)
     if "ate_m" not in figures:
         raise SegslamError(
@@ -126,8 +126,7 @@ def _score_run(
         )
     if len(reference) < num_scans:
         terminal.say(f"scored the {len(reference)} of {num_scans} scans that have a reference pose")
-    metrics = {key: value for key, value in run.metrics.items() if plain_name(key) not in ACCURACY}
-    metrics |= figures if how.align == "se3" else accuracy(run.result, reference, align=how.align)
+    metrics = {key: value for key, value in run.metrics.items() if plain_name(key) not in ACCURACY} | figures
     matched, truth = matched_poses(run.result.trajectory, reference)
     if plot is not None:
         from segslam.core.trajectory import begun_among, rows_of_same_scan

@@ -1,8 +1,7 @@
 """`segslam replay`, `edit` and `refine`: a new run from the log of another."""
 
-from collections.abc import Generator
 from contextlib import ExitStack, closing
-from itertools import chain, tee
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,12 +14,10 @@ from segslam.cli.options import WITH_MAP, FoxgloveOption, LogArgument, RunSettin
 from segslam.cli.viewers import serve_foxglove
 from segslam.core.errors import SegslamError
 from segslam.core.interrupts import EXIT_STATUS, when_stopped
-from segslam.slam.loop_edits import NO_EDITS, LoopEdits, Pair, pairs_of
+from segslam.slam.loop_edits import NO_EDITS, LoopEdits, pairs_of
 
 if TYPE_CHECKING:
-    from segslam.core.types import Step
     from segslam.output.log import RunLog
-    from segslam.run.run import Run
     from segslam.slam.slam_result import SlamResult
 
 OutOption = Annotated[Path, "New folder for the run."]
@@ -125,15 +122,13 @@ def _replay_log(
     from segslam.run.replay import Replay
     from segslam.slam.slam_result import outcome_text
 
-    before, now = set[Pair](), set[Pair]()
-
     def more(result: "SlamResult") -> dict[str, Any]:
         weights = result.estimate.closure_weights
         outcomes = {attempt.candidate.pair: outcome_text(attempt, weights) for attempt in result.attempts}
         for pair in sorted(edits.added):
             terminal.say(f"added {pair[0]}:{pair[1]}: {outcomes.get(pair, 'not tried, because the run ended before')}")
         left = {"num_scans_left": recorded.num_steps() - run.num_steps} if stopped else {}
-        return _compared(recorded, before, now) | left
+        return _compared(recorded, result, run.num_steps) | left
 
     replayed = Replay.of(log, config=changes.config, settings=changes.overrides(), edits=edits)
     recorded = replayed.recorded
@@ -149,7 +144,7 @@ def _replay_log(
         when_stopped(f"the log in {folder} is kept, without results")
         run = stack.enter_context(replayed.begun(folder, slam, mirror=server.send if server else None))
         copy_alone(recorded.path.parent, folder)
-        with closing(_repeated(recorded, run, before, now)) as steps:  # ends the thread that works
+        with closing(run.repeat(recorded.steps())) as steps:  # ends the thread that works
             stopped = is_interrupted(terminal.progress(steps, recorded.num_steps(), "replay"))
         if stopped and run.num_steps == 0:
             when_stopped("nothing was written")
@@ -160,32 +155,24 @@ def _replay_log(
         raise typer.Exit(EXIT_STATUS)
 
 
-def _repeated(recorded: "RunLog", run: "Run", before: set[Pair], after: set[Pair]) -> "Generator[Step, None, None]":
-    """Repeats the steps of a log; adds the pairs of their loops to `before`, those of the new loops to `after`."""
-    originals, sources = tee(recorded.steps())  # read alternately: only one step is in memory
-    for original, repeated in zip(originals, run.repeat(sources), strict=True):
-        before |= _closures(original)
-        after |= _closures(repeated)
-        yield repeated
-
-
-def _compared(recorded: "RunLog", before: set[Pair], after: set[Pair]) -> dict[str, Any]:
-    """Numbers of new and lost loops; the error of the logged run, if it finished and has ground truth."""
+def _compared(recorded: "RunLog", result: "SlamResult", num_steps: int) -> dict[str, Any]:
+    """Numbers of new and lost loops of so many steps; the error of the logged run, if it is finished and has truth."""
+    from segslam.core.types import LoopClosure
     from segslam.output.accuracy import trajectory_accuracy
 
+    steps = islice(recorded.steps(clouds=False), num_steps)
+    logged = (attempt for step in steps for attempt in step.attempts)
+    repeated = result.attempts[: len(result.attempts) - result.num_late_attempts]
+    before, after = (
+        {one.candidate.pair for one in attempts if isinstance(one.outcome, LoopClosure)}
+        for attempts in (logged, repeated)
+    )
     figures: dict[str, Any] = {"num_loops_won": len(after - before), "num_loops_lost": len(before - after)}
-    reference, result = recorded.reference(), recorded.result()
-    if reference is not None and result is not None:
-        error = trajectory_accuracy(result[1], reference)
+    reference, ending = recorded.reference(), recorded.result()
+    if reference is not None and ending is not None:
+        error = trajectory_accuracy(ending[1], reference)
         figures |= {"recorded_ate_m": error["ate_m"]} if "ate_m" in error else {}
     return figures
-
-
-def _closures(step: "Step") -> set[Pair]:
-    from segslam.core.types import LoopClosure
-
-    outcomes = (attempt.outcome for attempt in step.attempts)
-    return {outcome.pair for outcome in outcomes if isinstance(outcome, LoopClosure)}
 
 
 def _edits(run: Path, forbid: list[str], add: list[str], *, add_near_fixes: bool, terminal: Terminal) -> LoopEdits:

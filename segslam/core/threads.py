@@ -23,7 +23,9 @@ def at_once(first: Callable[[], First], second: Callable[[], Second]) -> tuple[F
         return first(), other.result()
 
 
-def in_other_thread(items: Iterable[Item], work: Callable[[Item], Done], *, max_waiting: int) -> Iterator[Done]:
+def in_other_thread(
+    items: Iterable[Item], work: Callable[[Item], Done], *, max_waiting: int
+) -> Generator[Done, None, None]:
     """Apply `work` to each item in another thread; yields the results in order.
 
     The calling thread produces the items, up to `max_waiting` ahead of the item in work. An exception of an item or of

@@ -4,7 +4,7 @@ import logging
 import math
 import shlex
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import chain, pairwise
@@ -189,7 +189,7 @@ class Run:
         """The current pose of each keyframe, and a function that reads its points, which is safe in other threads."""
         return dict(enumerate(self._slam.graph.T_world_keyframes.copy())), self._log.cloud
 
-    def repeat(self, steps: Iterator[Step]) -> Iterator[Step]:
+    def repeat(self, steps: Iterator[Step]) -> Generator[Step, None, None]:
         """Repeat the steps of a log, starting from the keyframes; this thread reads the log, another works."""
         return in_other_thread(steps, lambda step: self._logged(self._slam.repeat(step)), max_waiting=MOST_WAITING)
 

@@ -32,7 +32,7 @@ from segslam.core.errors import SegslamError
 from segslam.core.interrupts import EXIT_STATUS, when_stopped
 
 if TYPE_CHECKING:
-    from segslam.core.config import Config, MapConfig
+    from segslam.core.config import Config
     from segslam.core.types import BadScan, Step
     from segslam.odometry.sweep import Odometry
     from segslam.output.log import RunLog
@@ -101,7 +101,7 @@ def resume(
     chosen: dict[str, Any] = {name: value for name, value in recorded.options.items() if value}
     again = f"segslam map DATA --out {shlex.quote(str(run))} --resume"
     if "data" not in chosen and has_results(recorded) and not read_metrics(run).get("num_scans_left"):
-        _show_complete(recorded, [], terminal, config=recorded.config.map, place=None)  # live, merged or replayed
+        _show_complete(recorded, [], terminal, place=None)  # live, merged or replayed
         return
     if why := why_not_resumed(chosen, run):
         raise SegslamError(f"{recorded.path}: {why}")
@@ -187,7 +187,7 @@ def map_data(
         repeated = {name: value for name, value in choices.items() if name not in FREE_OPTIONS}
         check_same(recorded, settings, dataset=scans.name, options=repeated)
         if is_finished(recorded, scans):
-            _show_complete(recorded, map_files, terminal, config=settings.map, place=place)
+            _show_complete(recorded, map_files, terminal, place=place)
             return
     _map_scans(
         scans,
@@ -220,12 +220,7 @@ def _in_map(in_map: Path | None) -> "tuple[SlamOf | None, Callable[[Path], str] 
 
 
 def _show_complete(
-    recorded: "RunLog",
-    map_files: Sequence[Path],
-    terminal: Terminal,
-    *,
-    config: "MapConfig",
-    place: Callable[[Path], str] | None,
+    recorded: "RunLog", map_files: Sequence[Path], terminal: Terminal, *, place: Callable[[Path], str] | None
 ) -> None:
     """Give a finished run a place on the globe if it has none, write its missing maps, and show its figures."""
     from segslam.output.export import write_maps
@@ -239,7 +234,7 @@ def _show_complete(
         terminal.say(place(folder))
         write_report(folder)
     if missing := [file for file in map_files if not file.exists()]:
-        made = write_maps(recorded, missing, config=config, show=terminal.progress)
+        made = write_maps(recorded, missing, config=recorded.config.map, show=terminal.progress)
         terminal.say(map_summary(made, missing))
     if terminal.json:
         print_json(read_metrics(folder))

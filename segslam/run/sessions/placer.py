@@ -8,7 +8,7 @@ again without initial guess.
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import islice
 
 import numpy as np
@@ -24,7 +24,7 @@ from segslam.graph.chains import far_from_prior
 from segslam.graph.motions import PLACE_M
 from segslam.keyframes import Submaps
 from segslam.registration import refinement
-from segslam.registration.prepared import Observed, prepare_observed
+from segslam.registration.prepared import Observed
 from segslam.run.locator import Locator
 from segslam.slam.recognition import spread
 from segslam.slam.slam_result import TRUSTED_M
@@ -41,7 +41,7 @@ class Placer:
         """`submaps` provides the keyframes of the drive, which are in the graph."""
         self._config, self._locator, self._graph, self._submaps = config, locator, graph, submaps
         self._T_world_map = locator.session.T_world_keyframe
-        self._map_seen: Callable[[int], Observed] = lru_cache(NUM_PREPARED)(partial(self._seen, locator.submaps))
+        self._map_seen: Callable[[int], Observed] = lru_cache(NUM_PREPARED)(locator.submaps.observed)
         self._last: Placement | None = None
         """The newest placed keyframe."""
         self._found: list[Placement] = []
@@ -77,7 +77,7 @@ class Placer:
         apart_m = np.linalg.norm(self._T_world_map[:, :3, 3] - T_world_predicted[:3, 3], axis=1)
         outcome: Placement | Rejected = Rejected(RejectReason.NO_PLACE, f"{apart_m.min():.0f} m from the map")
         with watch("prepare"):
-            own = self._seen(self._submaps, keyframe_id)
+            own = self._submaps.observed(keyframe_id)
         near = np.argsort(apart_m)[: np.count_nonzero(apart_m <= OTHER_PLACE_M)].tolist()
         for target_id in islice(spread(near, self._T_world_map.__getitem__, SAME_PLACE_M), MAX_CANDIDATES):
             outcome = self._registered(keyframe_id, own, target_id, T_world_predicted, watch)
@@ -154,7 +154,3 @@ class Placer:
 
     def _motion(self, earlier_id: int, later_id: int) -> Transform:
         return geometry.inverse(self._submaps.T_odom[earlier_id]) @ self._submaps.T_odom[later_id]
-
-    def _seen(self, submaps: Submaps, keyframe_id: int) -> Observed:
-        submap = submaps.submap(keyframe_id)
-        return prepare_observed(submap.points, submap.labels, config=self._config, seen_from_here=submap.seen_from_here)

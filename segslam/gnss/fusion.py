@@ -1,11 +1,9 @@
 """Joint solution of a finished graph and the fixes, with a weight that the fixes themselves justify.
 
-The noise of drive and receiver is that of the largest likelihood (`evidence`). With it, the fixes of a receiver with
-slow errors hardly bend a consistent map. But a map may also have systematic errors that its graph does not claim; then
-a good receiver is right. So windows of fixes are held out, and of three stiffnesses (the drive keeps its shape, is bent
-by this noise, follows the fixes closely) the stiffest is used that does not predict the held-out fixes significantly
-worse than the best one does (paired t-test over the windows). A window is as long as the longest part of the drive
-without fixes: the solution is used there, too, and between fixes that are near every bent drive predicts well.
+With the noise of the largest likelihood (`evidence`), a receiver with slow errors hardly bends a consistent map. But a
+map may have systematic errors that its graph does not claim, and a good receiver is then right: held-out windows of
+fixes decide by a paired t-test (docs/gnss.md). Between fixes that are near every bent drive predicts well, so a window
+is as long as the longest part of the drive without fixes.
 """
 
 from collections.abc import Sequence
@@ -94,10 +92,7 @@ def fuse(
 
 
 def _best(graph: PositionedGraph, placement: Placement, candidates: Sequence[Vector], axis: int) -> Vector:
-    """The stiffest of three candidates, rigid, soft and close, whose cost is not significantly above the least one.
-
-    `axis`: 0 horizontally, 1 vertically.
-    """
+    """The stiffest of three candidates, rigid, soft and close, whose cost is not significantly above the least one."""
     reference = placement.residual(placement.T_enu_keyframe)
     windows = _windows(placement, placement.weights[:, axis] >= KEPT_WEIGHT)
     known = reference[np.isfinite(_along(reference, axis))]
@@ -143,10 +138,7 @@ def _held_out(
 
 
 def _solved(graph: PositionedGraph, placement: Placement, sigma: Vector) -> tuple[Poses, Weights, Points]:
-    """Poses, weights (n, 2) and precisions (n, 3) by iteratively reweighted least squares.
-
-    It starts from the largest chain of consistent fixes; later rounds weight all fixes by their residuals.
-    """
+    """Poses, weights (n, 2) and precisions (n, 3) by reweighted least squares, at first of the consistent fixes."""
     T, weights = placement.T_enu_keyframe, placement.weights
     for _ in range(ROUNDS):
         precisions = weights.take([0, 0, 1], axis=1) / sigma**2

@@ -73,10 +73,7 @@ def geodetic_from_ecef(ecef_m: Points) -> Geodetic:
 
 
 def enu_from_geodetic(places: Geodetic, origin: Origin) -> Points:
-    """(n, 3) east, north, up (m) of geodetic places (n, 3) in the local frame of `origin`.
-
-    Exact at any distance, also across the date line and the edges of UTM zones.
-    """
+    """(n, 3) east, north, up (m) of geodetic places (n, 3) in the local frame of `origin`, exact at any distance."""
     return (ecef_from_geodetic(places) - ecef_from_geodetic(np.array([origin]))) @ rotation_ecef_enu(origin)
 
 

@@ -50,11 +50,7 @@ def _is_recording(path: Path) -> bool:
 
 
 def _read_messages(recording: Path, topic: str) -> list[Row]:
-    """The fixes of a topic; of the only one if it is empty.
-
-    Raises SegslamError, naming the recording and its topics, if there is no such topic, if the recording cannot be
-    read, or if a package is missing.
-    """
+    """The fixes of a topic; of the only one if it is empty."""
     from segslam.scans.messages import BagMessages, McapMessages
 
     read = McapMessages if recording.suffix.lower() == ".mcap" else BagMessages

@@ -71,10 +71,7 @@ class Replay:
         return Path(name) if name else None
 
     def begun(self, folder: Path, slam: Slam | None = None, *, mirror: Mirror | None = None) -> Run:
-        """The new run in its folder, before its first step. By default, `slam` closes loops with the edits.
-
-        The log has the options that further replays need.
-        """
+        """The new run in its folder, before its first step. By default, `slam` closes loops with the edits."""
         options = {"in_map": str(self.in_map)} if self.in_map else {}
         if sessions := self.recorded.options.get("sessions"):
             options["sessions"] = sessions

@@ -169,10 +169,7 @@ class Run:
         self.num_scans_skipped = self._next_row - len(taken)
 
     def map(self, dataset: Dataset) -> Iterator[Step | BadScan]:
-        """Process and log each scan after those resumed; a bad scan is reported, counted and skipped.
-
-        Scans are read by the calling thread and tracked in a second; a third closes loops and logs the steps.
-        """
+        """Process and log each scan after those resumed, in three threads; a bad scan is reported and counted."""
         tracked = in_other_thread(self._read(dataset), self._track, max_waiting=1)
         return in_other_thread(tracked, self.follow, max_waiting=MOST_WAITING)
 
@@ -267,14 +264,11 @@ class Run:
         search_s: float = math.inf,
         progress: Progress = no_progress,
     ) -> tuple[dict[str, Any], str]:
-        """Finish the run, and write the rest of its folder: figures, place on the globe, maps, and the report.
+        """Finish the run, and write the rest of its folder; returns `metrics.json`, and what `place` returned.
 
-        Returns the content of `metrics.json`, and what was found when the run was placed on the globe.
-
-        `more` adds figures computed from the result. `place` georeferences the folder before the maps are written, and
-        returns what it found. `search_s` limits the last search for loops, and `progress` shows the adjustment, as in
-        `Slam.finish`. No map is written of a drive that was not localised anywhere. Raises SegslamError if there was no
-        step. A failure of place or maps leaves a report, and one of the place the maps.
+        `more` adds figures computed from the result; `place` georeferences the folder before the maps are written;
+        `search_s` and `progress` as in `Slam.finish`. No map is written of a drive that was not localised anywhere.
+        Raises SegslamError without a step. A failure of place or maps leaves a report, and one of the place the maps.
         """
         from segslam.output.report import write_report
 

@@ -44,10 +44,7 @@ def read_file(file: Path) -> Cloud:
 
 
 def _parse_npy(content: bytes) -> np.ndarray:
-    """The array (n, k) of a .npy file, of at least three columns of plain numbers, as stored.
-
-    Raises ValueError for another content, and for a file whose size is not that of the array.
-    """
+    """The array (n, k) of a .npy file, of at least three columns of plain numbers, as stored; else ValueError."""
     stream = BytesIO(content)
     try:
         is_first = npy.read_magic(stream) == (1, 0)

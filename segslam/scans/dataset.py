@@ -162,10 +162,9 @@ def make_scan(
 ) -> Scan:
     """The scan without invalid points: those with a NaN or infinity, and those at the origin, which mean "no return".
 
-    A distance whose square exceeds float32 (1.8e19 m) is infinite. This
-    function alone applies `vertical_angle_deg`; label sources see the points as stored. Labels, times and
-    intensities are reduced to the same points; the times of the others may be anything. Raises BadScan, naming
-    `source`, if no point remains.
+    A distance whose square exceeds float32 (1.8e19 m) is infinite. This function alone applies `vertical_angle_deg`;
+    label sources see the points as stored. Labels, times and intensities are reduced to the same points; the times of
+    the others may be anything. Raises BadScan, naming `source`, if no point remains.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # wild numbers, and NaNs that signal
         points = cloud.points.astype(np.float32, copy=False)

@@ -61,8 +61,7 @@ def preset_for(extent_m: float | None) -> Preset:
 def extent_m(scans: Dataset) -> float | None:
     """Median horizontal distance (m) of the surfaces around the sensor; None if no scan can be used.
 
-    Each occupied voxel counts once. The median is taken over scans spread evenly over the data set, or over its start
-    if it can only be read in order.
+    The median is over scans spread evenly over the data set, or over its start if it can only be read in order.
     """
     medians_m: list[float] = []
     last = min(len(scans), SEQUENTIAL_SCANS) if scans.is_sequential else len(scans)

@@ -42,10 +42,7 @@ class Recording(Dataset):
     """The selected scans of a recording. If it can only be read in order, going back restarts it."""
 
     def __init__(self, source: DataSource) -> None:
-        """The kind is that named by `source.dataset`, or found from the file or folder.
-
-        Raises SegslamError, with the error of the reader, if it cannot be opened or contains no scan.
-        """
+        """Raises SegslamError, with the error of the reader, if it cannot be opened or contains no scan."""
         kind, self._source, self._loader = _opened(source)
         place = self._source.resolve()
         beside = place.parent if place.name == "velodyne" else self._source  # here are times, poses and labels
@@ -172,10 +169,7 @@ def _opened(source: DataSource) -> tuple[str, Path, Any]:
 
 
 def _loader(kind: str, source: Path, sequence: str, topic: str) -> Any:
-    """The reader of a kind of data: scans by their number, as points and times, or as points alone.
-
-    Libraries of recordings are imported for their kind only.
-    """
+    """The reader of a kind of data: scans by their number; libraries of recordings are imported for their kind only."""
     match kind:
         case "generic":
             return ScanFolder(source)

@@ -19,10 +19,7 @@ MAX_SCAN_BYTES = 2**30
 MAX_HEADER_BYTES = 65_536
 """Largest header in which its last line is searched. Chosen: 1,000 comments; usual headers have 300 bytes."""
 TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "timestamps", "stamps")
-"""Names that drivers (Ouster, Velodyne, Hesai, Robosense, Livox) and programs use for the time of a point, in any unit.
-
-The first that exists is used.
-"""
+"""Names for the time of a point, in any unit (Ouster, Velodyne, Hesai, Robosense, Livox); the first there is counts."""
 INTENSITY_FIELDS = ("intensity", "reflectivity", "signal")
 """Names that drivers and programs use for the intensity; the first that exists is used."""
 UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
@@ -30,10 +27,7 @@ UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
 PERIODS_S = (0.05, 0.1, 0.2)
 """Periods of rotating LiDARs: 20, 10 or 5 Hz."""
 LONGEST_SEAM = 0.29
-"""Chosen: largest fraction of a period without returns at either end of the sweep.
-
-Above it, 15 Hz is taken for 10 Hz.
-"""
+"""Chosen: largest fraction of a period without returns at either end of the sweep; above it 15 Hz passes for 10 Hz."""
 LEAST_SHARE = 0.5
 """Chosen: times between 0 and 1 that span this are fractions; no LiDAR turns as slowly as twice per second."""
 JITTER = 0.02

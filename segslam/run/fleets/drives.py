@@ -166,10 +166,7 @@ def _text(value: Any, where: str) -> str:
 
 
 def _named(drives: list[Drive]) -> list[Drive]:
-    """The drives with names: those given, or the names of their files, numbered where these are equal.
-
-    Raises SegslamError for a recording that is given twice with the same options: its drives would be joined.
-    """
+    """The drives with names: those given, or the names of their files, numbered where these are equal."""
     for drive, count in Counter(replace(drive, name="") for drive in drives).items():
         if count > 1:
             raise SegslamError(f"{drive.data}: given twice with the same options; give each drive once")

@@ -1,7 +1,4 @@
-"""What a fleet keeps in a file for each pair of drives: their relation, and alignments of submaps.
-
-With the alignments, a component is adjusted again quickly.
-"""
+"""What a fleet keeps in a file for each pair of drives: their relation, and alignments of submaps."""
 
 import hashlib
 import json

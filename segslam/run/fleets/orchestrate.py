@@ -95,10 +95,7 @@ def fleet(
 
 @contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
-    """Context manager that locks a fleet's folder, where the file system can, and removes what interrupted steps left.
-
-    Raises SegslamError if another call works there, whose unfinished steps would be removed, or it cannot be written.
-    """
+    """Context manager that locks a fleet's folder, if the file system can, and removes what interrupted steps left."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = os.open(folder, os.O_RDONLY)

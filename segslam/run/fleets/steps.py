@@ -63,10 +63,7 @@ class Mapped:
 
 
 def _made_with(folder: Path) -> str:
-    """The key that a whole folder was made with; empty if there is no folder.
-
-    Raises SegslamError for a folder without a key: it is not of a fleet, and must not be replaced.
-    """
+    """The key that a whole folder was made with; empty if there is no folder. One without must not be replaced."""
     if not folder.exists():
         return ""
     try:
@@ -97,10 +94,7 @@ def map_drive(fleet: Path, drive: Drive) -> Mapped:
 
 
 def _config(drive: Drive, source: DataSource) -> Config:
-    """The settings of a drive: KISS-ICP has one thread, so that poses repeat exactly, unless they say otherwise.
-
-    Raises SegslamError for a wrong setting, and for an unknown preset.
-    """
+    """The settings of a drive: KISS-ICP has one thread, so that poses repeat exactly, unless they say otherwise."""
     if drive.preset != "auto" and drive.preset not in SETTINGS:
         raise SegslamError(f"preset: {drive.preset}: unknown preset; known: auto, {', '.join(SETTINGS)}")
     file = Path(drive.config) if drive.config else None

@@ -63,8 +63,8 @@ def attempted(function: Callable[..., Any], *arguments: Any) -> Outcome:
 def workers(folder: Path, *, number: int, scheduler: str | None) -> Iterator[tuple[Workers, str]]:
     """Runs tasks on the workers of a scheduler, or on so many processes of this machine; with its dashboard's address.
 
-    One process here needs no Dask. Raises SegslamError if the scheduler does not answer, has no worker, or if a worker
-    has another version or does not see the folder.
+    One process here needs no Dask. Raises SegslamError if Dask is missing, if the scheduler does not answer or has no
+    worker, or if a worker has another version or does not see the folder.
     """
     if scheduler is None and number == 1:
         yield lambda function, tasks: ((number, attempted(function, *task)) for number, task in enumerate(tasks)), ""
@@ -80,10 +80,7 @@ def workers(folder: Path, *, number: int, scheduler: str | None) -> Iterator[tup
 
 @contextmanager
 def cluster(shared: Path, *, workers: int, scheduler: str | None) -> Iterator[Any]:
-    """A Dask client for the scheduler at an address, or for local worker processes.
-
-    Raises SegslamError if Dask is not installed, and as `workers`.
-    """
+    """A Dask client for the scheduler at an address, or for local processes. Raises SegslamError as `workers`."""
     try:
         from distributed import Client, LocalCluster  # optional package: extra `cluster`
     except ImportError as error:

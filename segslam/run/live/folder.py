@@ -109,10 +109,7 @@ class FolderSource(Source):
         waiting.put(sent_ns, lambda index, stamp_ns: self._read(file, index, stamp_ns, content))
 
     def _put_missed(self, waiting: Waiting) -> None:
-        """Put the scans whose files have changed since the newest one that was put, in order.
-
-        A file that is still being written is put again when it is closed.
-        """
+        """Put the scans whose files have changed since the newest one that was put, in order."""
         since_ns = self._noted_ns.value
         found: list[tuple[int, Path]] = []
         for name in os.listdir(self._folder):

@@ -214,10 +214,7 @@ def _place_all(
 
 
 def _tracked(track: Track, arrival: Arrival, gap: float) -> Tracked | BadScan:
-    """The pose of a scan; BadScan for any exception of a single scan, because the run continues.
-
-    Raises OdometryEnded if no further scan can be placed.
-    """
+    """The pose of a scan; BadScan for any exception of a single scan, because the run continues."""
     try:
         return track(arrival.read(arrival.index, arrival.stamp_ns), gap=gap)
     except BadScan as error:

@@ -89,9 +89,8 @@ class Localiser(Slam):
 def localise(run: str | Path, data: str | Path, out: str | Path, **options: Any) -> FinishedRun:
     """Localise a folder of scans or a recording in the map of a finished run, like `segslam localise`.
 
-    The new folder `out` has the files of `map_folder`; its world frame, and its place on the globe, is that
-    of the finished run. Options are those of `map_folder`. Raises SegslamError as `map_folder`, and if the run did not
-    finish or is damaged.
+    Options, files and errors are those of `map_folder`; its world frame, and its place on the globe, is that of the
+    finished run. Raises SegslamError also if that did not finish or is damaged.
     """
     in_map = {"in_map": str(expanded(run).resolve())}
     made = map_folder(data, out, slam_of=localiser_in(run), options=in_map, **options)

@@ -58,10 +58,7 @@ class Merged:
         )
 
     def begun(self, folder: Path, config: Config, *, kept: Kept = nothing_kept) -> Run:
-        """The merged run in its folder, before it takes over the first of `steps`. `kept`: as for `write_merged`.
-
-        The log has the merged runs, and the offsets of their numbers.
-        """
+        """The merged run in its folder, before it takes over the first of `steps`. `kept`: as for `write_merged`."""
         rows = [
             {
                 "run": str(session.run.folder.resolve()),
@@ -109,10 +106,7 @@ class Merged:
         return {one.source_id: attempt(shifted(one, *shifts)) for one in session.found.found}
 
     def georeference(self, folder: Path) -> str:
-        """Place the merged run on the globe by the fixes of all its sessions.
-
-        Returns what was found; empty if no session has a place on the globe, or after a warning.
-        """
+        """Place the merged run on the globe by the fixes of all its sessions, if any; returns what was found."""
         rows, uses = list[Row](), set[str]()
         for session in self.sessions:
             fixes, used = recorded_fixes(session.run.folder, stamp_shift_ns=session.shift.stamp_ns)

@@ -17,17 +17,12 @@ SCALE_M, OFFSET_M = 0.005, -100.0
 """Those of the dataset's own `read_vel_sync.py`."""
 
 
-class NcltDay:
+class NcltDay(NCLTDataset):
     """The scans of `velodyne_sync/` within the time of the true poses, which are in `../ground_truth/`."""
 
     def __init__(self, folder: Path) -> None:
-        found = NCLTDataset(folder)
-        self.scan_files = [folder / "velodyne_sync" / name for name in found.scan_files]
-        self.gt_poses = found.gt_poses
-        self._stamps_us = found.timestamps
-
-    def __len__(self) -> int:
-        return len(self.scan_files)
+        super().__init__(folder)
+        self.scan_files: list[Path] = [folder / "velodyne_sync" / name for name in self.scan_files]
 
     def __getitem__(self, index: int) -> Cloud:
         """The points with z up. Raises ValueError for a truncated file."""
@@ -37,4 +32,4 @@ class NcltDay:
 
     def get_frames_timestamps(self) -> Vector:
         """(n,) seconds since 1970."""
-        return 1e-6 * self._stamps_us
+        return 1e-6 * self.timestamps

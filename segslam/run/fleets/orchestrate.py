@@ -5,7 +5,7 @@ import json
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -96,19 +96,17 @@ def fleet(
 @contextmanager
 def _alone_in(folder: Path) -> Iterator[None]:
     """Context manager that locks a fleet's folder, if the file system can, and removes what interrupted steps left."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = os.open(folder, os.O_RDONLY)
-    except OSError as error:
-        raise not_writable(folder, error) from error
-    try:
+    with ExitStack() as stack:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise SegslamError(f"{folder}: another call of segslam fleet works there; wait for its end") from error
-        except OSError as error:  # such as NFS, which does not lock folders
-            logger.info("%s: not locked (%s)", folder, error.strerror)
-        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = os.open(folder, os.O_RDONLY)
+            stack.callback(os.close, lock)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise SegslamError(f"{folder}: another call of segslam fleet works there; wait for its end") from error
+            except OSError as error:  # such as NFS, which does not lock folders
+                logger.info("%s: not locked (%s)", folder, error.strerror)
             steps.remove_unfinished(folder)
         except OSError as error:
             raise not_writable(folder, error) from error
@@ -117,8 +115,6 @@ def _alone_in(folder: Path) -> Iterator[None]:
         finally:
             with suppress(OSError):  # it is removed only if it is empty
                 folder.rmdir()
-    finally:
-        os.close(lock)
 
 
 class _Fleet:

@@ -18,7 +18,7 @@ from segslam.output.folder import copy_alone, new_folder
 from segslam.output.georeferenced import FILE, read_globe
 from segslam.output.log import Mirror, RunLog, read_log
 from segslam.run.run import Run
-from segslam.run.sessions.figures import parts_in
+from segslam.run.sessions.recorded import parts_in
 from segslam.slam.loop_edits import NO_EDITS, LoopEdits, Pair
 from segslam.slam.slam import Slam
 

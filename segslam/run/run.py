@@ -41,7 +41,7 @@ from segslam.output.folder import (
     write_poses,
 )
 from segslam.output.log import LogWriter, Mirror, RunLog, read_log
-from segslam.run.sessions.figures import figures_of, parts_in
+from segslam.run.sessions.recorded import figures_of, parts_in
 from segslam.scans import Dataset
 from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.adjustment.vertical_angle import measure_vertical_angle

@@ -26,7 +26,7 @@ from segslam.output.log import read_log
 from segslam.output.map import picture
 from segslam.output.report import comparison, figures
 from segslam.output.report.loops import top_view
-from segslam.run.sessions.figures import Part, figures_of
+from segslam.run.sessions.recorded import Part, figures_of
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("short_runs")]
 

@@ -33,22 +33,29 @@ class Intervals:
     """The usual time between scans, and gaps."""
 
     def __init__(self) -> None:
-        self._last_ns: int | None = None
+        self.last_ns: int | None = None
+        """The latest stamp."""
         self._intervals_s: deque[float] = deque(maxlen=WINDOW)
 
-    def gap(self, stamp_ns: int) -> float:
-        """Time since the last scan in usual intervals; 1 if no scan is missing, or if the stamps are unknown."""
-        interval_s = 0.0 if self._last_ns is None else (stamp_ns - self._last_ns) * 1e-9
+    @property
+    def usual_s(self) -> float:
+        """The usual time between scans; 0 if it is unknown."""
+        return median(self._intervals_s) if self._intervals_s else 0.0
+
+    def gap(self, stamp_ns: int, since_ns: int | None = None) -> float:
+        """Time since a stamp, by default the latest, in usual intervals; 1 if no scan is missing, or it is unknown."""
+        since_ns = self.last_ns if since_ns is None else since_ns
+        interval_s = 0.0 if since_ns is None else (stamp_ns - since_ns) * 1e-9
         if interval_s <= 0.0 or not self._intervals_s:
             return 1.0
-        gap = interval_s / median(self._intervals_s)
+        gap = interval_s / self.usual_s
         return gap if gap > LONG_GAP else 1.0
 
     def note(self, stamp_ns: int) -> None:
         """Note the stamp of a scan."""
-        if self._last_ns is not None and stamp_ns > self._last_ns:
-            self._intervals_s.append((stamp_ns - self._last_ns) * 1e-9)
-        self._last_ns = stamp_ns
+        if self.last_ns is not None and stamp_ns > self.last_ns:
+            self._intervals_s.append((stamp_ns - self.last_ns) * 1e-9)
+        self.last_ns = stamp_ns if self.last_ns is None else max(stamp_ns, self.last_ns)
 
 
 class MotionModel:

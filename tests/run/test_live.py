@@ -65,9 +65,9 @@ def test_gaps_are_counted_by_stamp_with_the_scans_that_they_lack() -> None:
         rhythm.note(number * INTERVAL_NS)
     assert (rhythm.tally.num_gaps, rhythm.tally.num_missing) == (2, 2 + 9)
     assert rhythm.tally.longest_gap_s == pytest.approx(1.0)
-    assert rhythm.intervals(0, 3 * INTERVAL_NS) == pytest.approx(3.0)
-    assert rhythm.intervals(0, int(1.2 * INTERVAL_NS)) == 1.0
-    assert rhythm.intervals(0, 1000 * INTERVAL_NS) == pytest.approx(1000.0)
+    assert rhythm.intervals.gap(3 * INTERVAL_NS, 0) == pytest.approx(3.0)
+    assert rhythm.intervals.gap(int(1.2 * INTERVAL_NS), 0) == 1.0
+    assert rhythm.intervals.gap(1000 * INTERVAL_NS, 0) == pytest.approx(1000.0)
 
 
 def test_stamps_continue_when_the_clock_of_the_sender_is_set_back() -> None:

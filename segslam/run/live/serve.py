@@ -19,6 +19,7 @@ from segslam.core.memory import keep_freed_memory
 from segslam.core.types import BadScan, Points, Scan, SegslamError, Step
 from segslam.odometry.apart import OdometryApart
 from segslam.odometry.kiss import KissOdometry
+from segslam.odometry.motion_model import WINDOW
 from segslam.odometry.tracker import Tracked, Tracker
 from segslam.run.live.waiting import Arrival, Source, Tally, Waiting
 from segslam.scans.presets import Preset, extent_of, preset_for
@@ -26,9 +27,6 @@ from segslam.scans.presets import Preset, extent_of, preset_for
 READY = b"ready"
 END_S = 5.0
 """Chosen: time for a source to end; the process does not wait longer for a middleware that hangs."""
-ROWS_CONTINUED = 30
-"""Chosen: number of last scans, beside the last keyframes, from which the odometry continues: its usual interval is the
-median of 21."""
 MOST_SHOWN = 200
 """Chosen: number of characters shown of an exception, which may contain the content of a file."""
 
@@ -172,12 +170,10 @@ def _continued(tracker: Tracker, past: Past, waiting: Waiting) -> Tracker:
         return tracker
     for step in past.steps:
         tracker.note(step)
-    waiting.rhythm.tally = Tally()  # the gaps between these scans are counted
-    for step in past.steps[-ROWS_CONTINUED:]:
-        waiting.rhythm.note(step.stamp_ns)
-    waiting.rhythm.tally = waiting.tally
+    for step in past.steps[-WINDOW:]:
+        waiting.rhythm.intervals.note(step.stamp_ns)  # the gaps between these scans are counted already
     keyframes = [row for row, _ in past.clouds]
-    last = range(max(len(past.steps) - ROWS_CONTINUED, keyframes[0]), len(past.steps))
+    last = range(max(len(past.steps) - WINDOW, keyframes[0]), len(past.steps))
     rows = sorted({*keyframes, *last})
     steps = [past.steps[row] for row in rows]
 
@@ -199,7 +195,7 @@ def _place_all(
     """Process each scan. Returns True if it ended because no scan came for `idle_s`."""
     last_ns = past.steps[-1].stamp_ns if past.steps else None
     while (arrival := waiting.take(idle_s)) is not None:
-        gap = 1.0 if last_ns is None else waiting.rhythm.intervals(last_ns, arrival.stamp_ns)
+        gap = 1.0 if last_ns is None else waiting.rhythm.intervals.gap(arrival.stamp_ns, last_ns)
         tracked = _tracked(track, arrival, gap)
         if isinstance(tracked, Tracked):
             last_ns = arrival.stamp_ns

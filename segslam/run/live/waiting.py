@@ -5,14 +5,13 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
 from threading import Condition, Event
 from time import monotonic
 
 import numpy as np
 
 from segslam.core.types import BadScan, Scan, Transform
-from segslam.odometry.motion_model import LONG_GAP
+from segslam.odometry.motion_model import Intervals
 from segslam.scans.dataset import Cloud, make_scan
 
 MOST_WAITING = 4
@@ -115,39 +114,24 @@ class Rhythm:
     """Tracks the stamps of arriving scans, and counts gaps."""
 
     def __init__(self, tally: Tally) -> None:
-        self._intervals_ns: deque[int] = deque(maxlen=21)
-        self._last_ns: int | None = None
+        self.intervals = Intervals()
         self._shift_ns = 0
         self.tally = tally
 
     def note(self, sent_ns: int) -> int:
         """The stamp of the next scan: as sent, or shifted to follow the last one if the clock was set."""
-        stamp_ns = sent_ns + self._shift_ns
-        last_ns = self._last_ns
+        stamp_ns, last_ns = sent_ns + self._shift_ns, self.intervals.last_ns
         if last_ns is not None and not last_ns - SET_BACK_NS <= stamp_ns <= last_ns + SET_FORWARD_NS:
-            self._shift_ns += last_ns + self._usual_ns() - stamp_ns
+            self._shift_ns += last_ns + round(1e9 * self.intervals.usual_s) - stamp_ns
             stamp_ns = sent_ns + self._shift_ns
             self.tally.num_clock_set += 1
-        if last_ns is not None and stamp_ns > last_ns:
-            interval_ns, usual_ns = stamp_ns - last_ns, self._usual_ns()
-            if usual_ns and interval_ns > LONG_GAP * usual_ns:
-                self.tally.num_gaps += 1
-                self.tally.num_missing += round(interval_ns / usual_ns) - 1
-                self.tally.longest_gap_s = max(self.tally.longest_gap_s, interval_ns * 1e-9)
-            self._intervals_ns.append(interval_ns)
-        self._last_ns = max(stamp_ns, last_ns or 0)
+        gap = self.intervals.gap(stamp_ns)
+        if last_ns is not None and gap > 1.0:
+            self.tally.num_gaps += 1
+            self.tally.num_missing += round(gap) - 1
+            self.tally.longest_gap_s = max(self.tally.longest_gap_s, (stamp_ns - last_ns) * 1e-9)
+        self.intervals.note(stamp_ns)
         return stamp_ns
-
-    def intervals(self, from_ns: int, to_ns: int) -> float:
-        """The time between two stamps in usual intervals: 1 if no scan is missing between them."""
-        usual_ns = self._usual_ns()
-        if usual_ns == 0:
-            return 1.0
-        gap = (to_ns - from_ns) / usual_ns
-        return 1.0 if gap < LONG_GAP else gap
-
-    def _usual_ns(self) -> int:
-        return int(median(self._intervals_ns)) if self._intervals_ns else 0
 
 
 class Source:

@@ -96,28 +96,26 @@ def _row(file: Path, number: int, cells: Sequence[str], places: dict[str, int]) 
     if len(cells) <= needed:
         raise bad_line(file, number, f"{len(cells)} columns; at least {needed + 1} are needed")
 
-    def cell(name: str) -> str:
-        place = places.get(name, len(cells))
-        return cells[place] if place < len(cells) else ""
+    known = {name: cells[place] for name, place in places.items() if place < len(cells)}
 
     def value(name: str) -> float:
-        return number_in(file, number, cell(name), name)
+        return number_in(file, number, known.get(name, ""), name)
 
     latitude, longitude = value("latitude"), value("longitude")
     check_degrees(file, number, latitude, longitude)
     both = value("sigma")
     east, north, up = (value(f"sigma_{axis}") for axis in ("east", "north", "up"))
     is_ns = "time_ns" in places
-    stamp_ns = _stamp(file, number, cell("time_ns" if is_ns else "time"), is_ns=is_ns)
+    stamp_ns = _stamp(file, number, known["time_ns" if is_ns else "time"], is_ns=is_ns)
     if "fraction_ns" in places and not is_ns:
-        stamp_ns += _stamp(file, number, cell("fraction_ns"), is_ns=True)
+        stamp_ns += _stamp(file, number, known.get("fraction_ns", ""), is_ns=True)
     return Row(
         stamp_ns,
         latitude,
         longitude,
         value("height"),
         (both if np.isnan(east) else east, both if np.isnan(north) else north, up),
-        has_fix=all(_has_fix(cell(name), least) for name, least in LEAST_STATUS.items()),
+        has_fix=all(_has_fix(known.get(name, ""), least) for name, least in LEAST_STATUS.items()),
     )
 
 

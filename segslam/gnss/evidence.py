@@ -43,16 +43,12 @@ PRIOR_DRIFT_FACTOR = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """The noise of drive and receiver of largest likelihood, along one axis or two, and the constants with it."""
+    """The noise of largest likelihood along one axis or two, s, q, tau and w, and the constants with it."""
 
     drift_factor: float
-    """s"""
     sigma_m: float
-    """q"""
     time_constant_s: float
-    """tau"""
     white_m: float
-    """w"""
     constants: Vector
     """(c,) the most likely constants, as differences to those with which the residuals were computed."""
     constant_sigma: Vector

@@ -242,11 +242,8 @@ def read_stamps(file: Path) -> Indices:
         except ValueError as error:
             raise SegslamError(f"{file}:{number}: {error}; correct the line") from error
         if stamp_ns < 0 or (stamps and stamp_ns <= stamps[-1]):
-            wrong = (
-                "is negative"
-                if stamp_ns < 0
-                else f"is not later than the previous line, {brief(lines[len(stamps) - 1][1])}"
-            )
+            before = brief(lines[len(stamps) - 1][1])
+            wrong = "is negative" if stamp_ns < 0 else f"is not later than the previous line, {before}"
             raise SegslamError(f"{file}:{number}: {brief(line)} {wrong}; times must ascend and not be negative")
         stamps.append(stamp_ns)
     return np.array(stamps, dtype=np.int64)

@@ -1,6 +1,6 @@
 """Settings for kinds of environments: street, campus, indoor."""
 
-from types import MappingProxyType
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
@@ -12,22 +12,20 @@ from segslam.scans import Dataset
 from segslam.scans.kitti import VERTICAL_ANGLE_DEG
 
 Preset = Literal["driving", "campus", "indoor"]
-SETTINGS = MappingProxyType[Preset, tuple[str, ...]](
-    {
-        "driving": (),
-        "campus": ("proximity.min_travel_m=25",),
-        "indoor": (
-            "odometry.voxel_size_m=0.4",
-            "odometry.min_range_m=0.5",
-            "odometry.max_range_m=40",
-            "keyframes.distance_m=1",
-            "proximity.min_travel_m=20",
-        ),
-    }
-)
+SETTINGS: Mapping[Preset, tuple[str, ...]] = {
+    "driving": (),
+    "campus": ("proximity.min_travel_m=25",),
+    "indoor": (
+        "odometry.voxel_size_m=0.4",
+        "odometry.min_range_m=0.5",
+        "odometry.max_range_m=40",
+        "keyframes.distance_m=1",
+        "proximity.min_travel_m=20",
+    ),
+}
 """Differences from the defaults, which are for driving. Chosen on `courtyard` and a simulated office (indoor) and on
 NCLT (campus): ATE 0.022 instead of 0.030 m, 0.020 instead of 0.028 m, and 0.20 instead of 0.22 to 0.35 m."""
-LARGEST_M = MappingProxyType[Preset, float]({"indoor": 12.0, "campus": 17.0})
+LARGEST_M: Mapping[Preset, float] = {"indoor": 12.0, "campus": 17.0}
 """Chosen: largest `extent_m` of such an environment. Measured: office 7 m, courtyard 10 m, NCLT 14 m, KITTI 00 20 m,
 and 23 to 30 m along the simulated 06."""
 VOXEL_M = 0.5

@@ -76,10 +76,7 @@ def key_of(*parts: Any) -> str:
 def _state(path: Path) -> list[tuple[str, int, int]]:
     """Name, size and time of each file of a recording."""
     try:
-        if path.is_file():
-            files = [path]
-        else:
-            files = sorted(Path(folder) / name for folder, names in _walked(path) for name in names)
+        files = [path] if path.is_file() else sorted(_files_in(path))
         states = [(file, file.stat()) for file in files]
     except OSError as error:
         raise SegslamError(f"{unreadable(path, 'recording', error)}; correct the list of drives") from error
@@ -97,14 +94,14 @@ def _separate_weights(model: Path) -> list[Path]:
     return [file for name in names if (file := model.parent / os.fsdecode(name)).is_file()]
 
 
-def _walked(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Each folder within a folder, with the names of its files; links to folders are followed, each folder once."""
+def _files_in(path: Path) -> Iterator[Path]:
+    """The files within a folder; links to folders are followed, each folder once."""
     walked = {os.path.realpath(path)}
     for folder, within, names in os.walk(path, onerror=_raise, followlinks=True):
         real = {os.path.realpath(os.path.join(folder, name)): name for name in sorted(within)}
         within[:] = [name for target, name in real.items() if target not in walked]
         walked |= set(real)
-        yield folder, names
+        yield from (Path(folder) / name for name in names)
 
 
 def _raise(error: OSError) -> None:

@@ -126,6 +126,8 @@ class _Fleet:
         self._reasons: dict[str, str] = {}
 
     def run(self, drives: Sequence[Drive], same_reference: bool) -> FleetResult:
+        from segslam.run.fleets.report import write_report
+
         mapped = self._done("index", steps.index_drive, self._done("map", steps.map_drive, drives))
         if not mapped:
             first, why = next(iter(self._reasons.items()))
@@ -139,7 +141,14 @@ class _Fleet:
             state = {"state": "failed" if reason else "mapped", "component": where.get(drive.name)}
             states[drive.name] = state | ({"reason": reason} if reason else {})
         result = FleetResult(self._folder, states, tuple(made), self._watch.seconds)
-        _write(result)
+        values = {
+            "drives": result.drives,
+            "components": result.components,
+            "num_loops_between": result.num_loops_between,
+            "seconds": {name: round(seconds, 3) for name, seconds in result.seconds.items()},
+        }
+        write_whole(self._folder / FILE, json.dumps(values, indent=2) + "\n")
+        write_report(result)
         failed = [one["reason"] for one in made if "reason" in one]
         if failed:
             raise WorkFailed(f"{self._folder}: {failed[0]}; correct it, and call `segslam fleet` again to go on")
@@ -213,17 +222,3 @@ def _value(outcome: Outcome, drive: Mapped) -> Any:
     if outcome.failure is not None:
         raise WorkFailed(f"{drive.name}: {outcome.failure}; call `segslam fleet` again to go on")
     return outcome.value
-
-
-def _write(result: FleetResult) -> None:
-    """`fleet.json`, and the report."""
-    from segslam.run.fleets.report import write_report
-
-    values = {
-        "drives": result.drives,
-        "components": result.components,
-        "num_loops_between": result.num_loops_between,
-        "seconds": {name: round(seconds, 3) for name, seconds in result.seconds.items()},
-    }
-    write_whole(result.folder / FILE, json.dumps(values, indent=2) + "\n")
-    write_report(result)

@@ -6,7 +6,7 @@ import re
 import select
 import struct
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from multiprocessing.sharedctypes import RawValue
 from pathlib import Path
@@ -145,12 +145,9 @@ def stamp_of_name(stem: str) -> int | None:
     return int(found["s"]) * 1_000_000_000 + int(found["fraction"].ljust(9, "0"))
 
 
-def _events(data: bytes) -> list[tuple[int, str]]:
+def _events(data: bytes) -> Iterator[tuple[int, str]]:
     """Mask and file name of each event."""
-    events, offset = [], 0
-    while offset < len(data):
-        _, mask, _, length = EVENT.unpack_from(data, offset)
-        offset += EVENT.size
-        events.append((mask, os.fsdecode(data[offset : offset + length].rstrip(b"\0"))))
-        offset += length
-    return events
+    while data:
+        _, mask, _, length = EVENT.unpack_from(data)
+        yield mask, os.fsdecode(data[EVENT.size : EVENT.size + length].rstrip(b"\0"))
+        data = data[EVENT.size + length :]

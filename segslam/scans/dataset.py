@@ -12,17 +12,7 @@ from segslam.core.errors import brief, counted
 from segslam.core.geometry import raise_beams
 from segslam.core.points import squared_ranges
 from segslam.core.trajectory import nanoseconds
-from segslam.core.types import (
-    BadScan,
-    Indices,
-    Points,
-    Scan,
-    ScanLabels,
-    SegslamError,
-    Trajectory,
-    Transform,
-    Vector,
-)
+from segslam.core.types import BadScan, Indices, Points, Scan, ScanLabels, SegslamError, Trajectory, Transform, Vector
 from segslam.core.whole_files import expanded, read_text
 from segslam.labels.encodings import ENCODINGS, Encoding
 from segslam.labels.label_files import LabelSource, of_rows
@@ -30,7 +20,6 @@ from segslam.scans.scan_files import sweep_times
 
 logger = logging.getLogger(__name__)
 
-ASSUMED_PERIOD_NS = 100_000_000  # 10 Hz, the rate of most LiDARs; used if there are no stamps
 NO_LIMIT = 2**63 - 1
 
 

@@ -18,17 +18,9 @@ from segslam.core.trajectory import read_poses
 from segslam.core.types import BadScan, SegslamError, Trajectory
 from segslam.labels.label_files import open_labels
 from segslam.scans.clouds import SUFFIXES, read_file
-from segslam.scans.dataset import (
-    ASSUMED_PERIOD_NS,
-    Cloud,
-    Dataset,
-    DataSource,
-    check_num_lines,
-    no_topics,
-    read_stamps,
-    selected_rows,
-)
+from segslam.scans.dataset import Cloud, Dataset, DataSource, check_num_lines, no_topics, read_stamps, selected_rows
 
+ASSUMED_PERIOD_NS = 100_000_000  # 10 Hz, the rate of most LiDARs; used if there are no stamps
 KIND_OF_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "ouster"}
 REMEDIES = {
     "mcap": "; `mcap recover IN -o OUT` copies what can be read",

@@ -11,21 +11,10 @@ from numpy.typing import ArrayLike
 
 from segslam.candidates import PlaceCandidate, Places, PlaceSignature, signature_of, signatures_around
 from segslam.core.config import Config
-from segslam.core.errors import brief
+from segslam.core.errors import SegslamError, brief
 from segslam.core.points import within_range
 from segslam.core.threads import at_once
-from segslam.core.types import (
-    Alignment,
-    Found,
-    Labels,
-    Points,
-    Rejected,
-    RejectReason,
-    SegslamError,
-    Transform,
-    as_labels,
-    as_points,
-)
+from segslam.core.types import Alignment, Found, Labels, Points, Rejected, RejectReason, Transform, as_labels, as_points
 from segslam.core.whole_files import expanded
 from segslam.graph import PoseGraph
 from segslam.keyframes import Submaps, downsample_keyframe

@@ -1,7 +1,6 @@
 """The front process as seen from the main process: poses of the scans, as they come.
 
-Loop closing, graph, log and viewers run in the main process. They cannot delay a pose: poses are sent to the main
-process by a separate thread, and the only message in the other direction is the request to stop. If the front process
+It does not wait for other work: a thread sends the poses, and the only message in return is the request to stop. If it
 dies, for example for lack of memory, another one continues from its last poses.
 """
 

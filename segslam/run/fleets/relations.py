@@ -15,17 +15,15 @@ from segslam.run.sessions.session_pose import MOST_FAILED, Relation
 
 
 def inverted(found: LoopClosure) -> LoopClosure:
-    """The same as the pose of the target in the source."""
-    alignment = found.alignment
-    back = replace(alignment, coarse=_inverted(alignment.coarse), fine=_inverted(alignment.fine))
-    return LoopClosure.of(found.target_id, found.source_id, back)
+    """The same as the pose of the target in the source: `T exp(x)` has the inverse `inverse(T) exp(-Ad(T) x)`."""
 
+    def back(pose: Registration) -> Registration:
+        undone = np.linalg.inv(adjoints(pose.T_target_source[None])[0])
+        information = undone.T @ pose.information @ undone
+        return replace(pose, T_target_source=geometry.inverse(pose.T_target_source), information=information)
 
-def _inverted(pose: Registration) -> Registration:
-    """`T exp(x)` has the inverse `inverse(T) exp(-Ad(T) x)`."""
-    undone = np.linalg.inv(adjoints(pose.T_target_source[None])[0])
-    information = undone.T @ pose.information @ undone
-    return replace(pose, T_target_source=geometry.inverse(pose.T_target_source), information=information)
+    alignment = replace(found.alignment, coarse=back(found.alignment.coarse), fine=back(found.alignment.fine))
+    return LoopClosure.of(found.target_id, found.source_id, alignment)
 
 
 class Components:

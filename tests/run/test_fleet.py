@@ -263,6 +263,18 @@ def test_a_worker_that_cannot_take_part_is_refused(client: _Client, message: str
         workers._check(client, tmp_path, "tcp://b")
 
 
+def test_without_dask_several_processes_are_refused_with_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("dask", "distributed"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with (
+        pytest.raises(SegslamError, match="need Dask: pip install"),
+        workers.workers(tmp_path, number=2, scheduler=None),
+    ):
+        pass
+
+
 def test_nothing_mapped_is_an_error_with_the_first_reason(
     recordings: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -69,12 +69,7 @@ def workers(folder: Path, *, number: int, scheduler: str | None) -> Iterator[tup
     if scheduler is None and number == 1:
         yield lambda function, tasks: ((number, attempted(function, *task)) for number, task in enumerate(tasks)), ""
         return
-    import dask
-
-    with (
-        dask.config.set({"distributed.worker.daemon": False}),
-        cluster(folder, workers=number, scheduler=scheduler) as client,
-    ):
+    with cluster(folder, workers=number, scheduler=scheduler) as client:
         yield partial(_on_cluster, client), client.dashboard_link if scheduler else ""
 
 
@@ -82,7 +77,8 @@ def workers(folder: Path, *, number: int, scheduler: str | None) -> Iterator[tup
 def cluster(shared: Path, *, workers: int, scheduler: str | None) -> Iterator[Any]:
     """A Dask client for the scheduler at an address, or for local processes. Raises SegslamError as `workers`."""
     try:
-        from distributed import Client, LocalCluster  # optional package: extra `cluster`
+        import dask  # optional package: extra `cluster`
+        from distributed import Client, LocalCluster
     except ImportError as error:
         raise SegslamError(f"--workers and --scheduler need Dask: {how_to_install('cluster')}") from error
     logs = [logging.getLogger(name) for name in ("distributed", "distributed.nanny")]
@@ -98,6 +94,7 @@ def cluster(shared: Path, *, workers: int, scheduler: str | None) -> Iterator[An
             _check(client, shared, scheduler)
             yield client
         return
+    dask.config.set({"distributed.worker.daemon": False})
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is for this process, which ends all
     try:
         options = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.ERROR}

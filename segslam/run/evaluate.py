@@ -39,12 +39,12 @@ def evaluate(
         raise SegslamError(f"evaluate: rpe_distance_m={rpe_distance_m}; give a distance above 0")
     if np.shape(up) != (3,) or not 0.0 < np.linalg.norm(up) < np.inf:
         raise SegslamError(f"evaluate: up={up}; give the direction of the upward axis, such as (0, 0, 1)")
-    made = _read(estimate)
+    made, run = _read(estimate)
     if reference is None:
-        reference = made.reference if isinstance(made, FinishedRun) else None
+        reference = run.reference if run else None
         if reference is None:
             raise SegslamError("evaluate: no ground truth; give `reference`")
-    matched, truth = matched_poses(_poses(made), _poses(_read(reference, made)))
+    matched, truth = matched_poses(made, _read(reference, run)[0])
     x, y, z = (np.asarray(up) / np.linalg.norm(up)).tolist()
     figures = scores(matched, truth, align=align, rpe_distance_m=rpe_distance_m, up=(x, y, z))
     if not figures:
@@ -52,20 +52,16 @@ def evaluate(
     return figures
 
 
-def _read(given: Given, of: FinishedRun | Trajectory | PoseFile | None = None) -> FinishedRun | Trajectory | PoseFile:
-    """What is given; a file is the reference `of` a run, if there is one."""
-    if isinstance(given, FinishedRun | Trajectory):
-        return given
+def _read(given: Given, of: FinishedRun | None = None) -> tuple[Trajectory | PoseFile, FinishedRun | None]:
+    """The poses, and the run that has them, if one does; a file is the reference `of` a run, if there is one."""
     if isinstance(given, str | Path):
         path = expanded(given)
-        if folder_of(path).is_dir():
-            return read_run(path)
-        return true_poses(path, of) if isinstance(of, FinishedRun) else read_poses(path)
-    return PoseFile(as_poses(given, "evaluate"), None)
-
-
-def _poses(known: FinishedRun | Trajectory | PoseFile) -> Trajectory | PoseFile:
-    return known.result.trajectory if isinstance(known, FinishedRun) else known
+        if not folder_of(path).is_dir():
+            return true_poses(path, of) if of else read_poses(path), None
+        given = read_run(path)
+    if isinstance(given, FinishedRun):
+        return given.result.trajectory, given
+    return given if isinstance(given, Trajectory) else PoseFile(as_poses(given, "evaluate"), None), None
 
 
 def matched_poses(

@@ -19,22 +19,29 @@ from segslam.core.memory import note_peak_with, peak_of_copy_mb
 
 Item = TypeVar("Item")
 Done = TypeVar("Done")
+Progress = Callable[[Iterable[Any], int, str], Iterator[Any]]
+"""Passes items on and shows progress: takes the items, their number, and a title."""
 MOST = 8
 """Chosen: number of processes that share work; each other one takes some 110 MB (KITTI 00 whole)."""
+
+
+def no_progress(items: Iterable[Any], total: int, title: str) -> Iterator[Any]:
+    """Shows nothing."""
+    yield from items
 
 
 def in_parts(
     items: Sequence[Item],
     work: Callable[[Sequence[Item]], Iterable[Done]],
     *,
-    progress: Callable[[Iterable[Done], int, str], Iterable[Done]] = lambda done, *_: done,
+    progress: Progress = no_progress,
     title: str = "",
 ) -> Iterator[Done]:
     """The results of `work`, in order, for consecutive parts of the items: one here, the others in copies.
 
     A part must not depend on what the work on another one changes in memory, and `work` should return small objects.
-    `progress` shows the part that is done here: it passes on the results, and gets their number and a title. All is
-    done here where there is one core, and while other threads run: a copy would wait forever for a lock that they hold.
+    `progress` shows the part that is done here. All is done here where there is one core, and while other threads run:
+    a copy would wait forever for a lock that they hold.
     """
     first, *others = np.array_split(np.arange(len(items)), max(1, min(_num_processes(), len(items))))
     copies: list[_Copy] = []

@@ -14,13 +14,13 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from segslam.core.config import MapConfig, load_config
+from segslam.core.processes import Progress, no_progress
 from segslam.core.types import Indices, Keyframe, SegslamError, Transform
 from segslam.core.whole_files import all_expanded, cannot_write, expanded, whole_file
 from segslam.output.finished import read_corrections, read_result
 from segslam.output.folder import PLACE_ON_GLOBE
 from segslam.output.log import RunLog, read_log
 from segslam.output.map.write import check_files, write_map
-from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.slam_result import SlamResult
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from segslam.core.whole_files import expanded
 from segslam.output.folder import ALONE, LOG, folder_of, read_alone, read_localised
 from segslam.output.log import RunLog, read_log
 from segslam.output.words import FIGURES
-from segslam.slam.adjustment import Correction, corrections_of, velocities_of
+from segslam.slam.adjustment.sweeps import Correction, corrections_of, velocities_of
 from segslam.slam.slam import SlamResult
 
 STAMP_TOLERANCE_NS = 10_000_000

@@ -19,6 +19,7 @@ import numpy as np
 from segslam.core.config import config_to_yaml
 from segslam.core.errors import LateScan
 from segslam.core.memory import give_back, peak_mb
+from segslam.core.processes import Progress, no_progress
 from segslam.core.threads import in_other_thread
 from segslam.core.trajectory import travelled_m
 from segslam.core.types import BadScan, CloudOf, MotionState, Scan, SegslamError, Step, Trajectory, Transform
@@ -43,7 +44,6 @@ from segslam.output.folder import (
 from segslam.output.log import LogWriter, Mirror, RunLog, read_log
 from segslam.run.sessions.recorded import figures_of, parts_in
 from segslam.scans import Dataset
-from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.adjustment.vertical_angle import measure_vertical_angle
 from segslam.slam.slam import Slam, SlamResult, Tracked
 

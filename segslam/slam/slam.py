@@ -14,6 +14,7 @@ import numpy as np
 from segslam.core.config import Config, check_config
 from segslam.core.errors import counted
 from segslam.core.memory import give_back
+from segslam.core.processes import Progress, no_progress
 from segslam.core.threads import Stopwatch
 from segslam.core.trajectory import corrected_poses
 from segslam.core.types import (
@@ -39,7 +40,9 @@ from segslam.odometry.sweep import Odometry, OdometryResult
 from segslam.odometry.tracker import Tracked as Tracked
 from segslam.odometry.tracker import Tracker
 from segslam.registration.prepared import Labeller
-from segslam.slam.adjustment import Known, Progress, adjust, no_progress, velocities_of
+from segslam.slam.adjustment.known import Known
+from segslam.slam.adjustment.rounds import adjust
+from segslam.slam.adjustment.sweeps import velocities_of
 from segslam.slam.loop_edits import NO_EDITS, LoopEdits
 from segslam.slam.loops import ROUNDS, LoopCloser
 from segslam.slam.slam_result import SlamResult as SlamResult

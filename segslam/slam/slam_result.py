@@ -37,7 +37,7 @@ from segslam.core.types import (
 )
 from segslam.core.whole_files import check_target, expanded
 from segslam.odometry.motion_model import information_of
-from segslam.slam.adjustment import Adjusted
+from segslam.slam.adjustment.rounds import Adjusted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,8 +10,8 @@ from segslam.output.finished import read_corrections, read_metrics, read_run
 from segslam.output.folder import ADJUSTED_GRAPH
 from segslam.output.log import read_log
 from segslam.run.sessions.recorded import known_of, read_session
-from segslam.slam.adjustment import Sweep, rounds
-from segslam.slam.adjustment.sweeps import swept
+from segslam.slam.adjustment import rounds
+from segslam.slam.adjustment.sweeps import Sweep, swept
 
 pytestmark = pytest.mark.usefixtures("short_runs")
 

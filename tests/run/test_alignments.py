@@ -10,9 +10,9 @@ from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.types import SegslamError
 from segslam.run.fleets.kept import Alignments, KeptAlignment, Part, part_of, read_kept, write_kept
-from segslam.slam.adjustment import Adjustment
 from segslam.slam.adjustment.alignment import Alignment
 from segslam.slam.adjustment.known import Guess
+from segslam.slam.adjustment.rounds import Adjustment
 
 RNG = np.random.default_rng(5)
 FOUND = Adjustment(9, 8, 0, 1.0, 1.0, 0.2, True, 1.0, sweep_s=0.1, sweep_sigma_s=0.002, sweep_from_deg=180.0)

@@ -9,9 +9,10 @@ from segslam.core.config import Config
 from segslam.core.points import voxel_first
 from segslam.core.types import Transform
 from segslam.graph import PoseGraph
-from segslam.slam.adjustment import Correction, Known, Velocities, adjust
 from segslam.slam.adjustment.alignment import Alignment
-from segslam.slam.adjustment.known import STEP_M, STEP_RAD, Compute, Guess, rounded, transform_of
+from segslam.slam.adjustment.known import STEP_M, STEP_RAD, Compute, Guess, Known, rounded, transform_of
+from segslam.slam.adjustment.rounds import adjust
+from segslam.slam.adjustment.sweeps import Correction, Velocities
 from segslam.slam.adjustment.vertical_angle import VerticalAngle
 
 RNG = np.random.default_rng(2)

@@ -15,7 +15,9 @@ from segslam.core.points import voxel_first
 from segslam.core.types import Alignment, LoopClosure, Registration
 from segslam.graph import Edge, PoseGraph
 from segslam.graph.levenberg_marquardt import Unsolvable
-from segslam.slam.adjustment import Adjusted, Velocities, adjust, rounds
+from segslam.slam.adjustment import rounds
+from segslam.slam.adjustment.rounds import Adjusted, adjust
+from segslam.slam.adjustment.sweeps import Velocities
 from segslam.slam.adjustment.vertical_angle import VerticalAngle
 
 STEP_M = 2.0

@@ -12,8 +12,16 @@ from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.points import voxel_first
 from segslam.core.types import Motion, MotionState, Trajectory
-from segslam.slam.adjustment import Correction, Sweep, Velocities, corrections_of, velocities_of
-from segslam.slam.adjustment.sweeps import common_sweep, measure_sweep, swept
+from segslam.slam.adjustment.sweeps import (
+    Correction,
+    Sweep,
+    Velocities,
+    common_sweep,
+    corrections_of,
+    measure_sweep,
+    swept,
+    velocities_of,
+)
 
 CONFIG = Config().refine
 NUM, STEP_M, INTERVAL_S = 36, 2.0, 0.2

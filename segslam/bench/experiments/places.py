@@ -12,8 +12,8 @@ from jaxtyping import Float, UInt8
 from segslam.candidates import Places, signature_of_standing
 from segslam.core import geometry
 from segslam.core.errors import unreadable
+from segslam.core.processes import Progress, no_progress
 from segslam.core.types import Points, SegslamError
-from segslam.slam.adjustment import Progress, no_progress
 
 CELL_M = 0.4
 """Size of a cell of the columns, and height of its voxels."""

@@ -35,7 +35,7 @@ from segslam.output.log.container import CutError, message_within
 from segslam.output.log.foxglove import transforms
 from segslam.output.log.records import Bulk, KeyframePoints, codec, intensities, points_and_labels
 from segslam.output.log.schema import restored
-from segslam.slam.adjustment import Adjustment
+from segslam.slam.adjustment.rounds import Adjustment
 
 logger = logging.getLogger(__name__)
 NOT_OURS = (LookupError, ValueError, TypeError, AttributeError, OverflowError, RecursionError, DecodeError)

@@ -23,7 +23,7 @@ from segslam.core.config import Config, config_to_yaml
 from segslam.core.extras import installed_version
 from segslam.core.types import GraphEstimate, LateLoops, Step, Trajectory, Transform
 from segslam.output.log.records import KeyframePoints, codec
-from segslam.slam.adjustment import Adjustment
+from segslam.slam.adjustment.rounds import Adjustment
 
 VERSION = 1
 """Increased whenever readers of the previous version would misread a log."""

@@ -34,7 +34,7 @@ from segslam.output.log.container import message_within
 from segslam.output.log.drawing import Drawing, ground_truth, map_message, map_points, words
 from segslam.output.log.records import KeyframePoints, codec, keyframe_points, points_and_labels
 from segslam.output.log.schema import channels, metadata
-from segslam.slam.adjustment import Adjusted
+from segslam.slam.adjustment.rounds import Adjusted
 
 POSES_PER_KEYFRAME = 50
 """Chosen: number of logged poses of estimates per keyframe, about 4 kB each, so that the log grows with the drive

@@ -19,6 +19,7 @@ from segslam.core import geometry
 from segslam.core.config import MapConfig
 from segslam.core.extras import how_to_install
 from segslam.core.points import within_range
+from segslam.core.processes import Progress, no_progress
 from segslam.core.types import Keyframe, Label, Points, SegslamError, Transform, Vector
 from segslam.core.whole_files import check_target, temporary_folder, whole_file
 from segslam.labels.encodings import of_classes
@@ -28,7 +29,6 @@ from segslam.output.map.grid import Grid, free_range_m
 from segslam.output.map.picture import GeoTiff, Picture, of_numbers
 from segslam.output.map.tiles import Part, Tile, Tiles, corner, distance_m
 from segslam.output.map.views import moved, nearest_returns
-from segslam.slam.adjustment import Progress, no_progress
 
 if TYPE_CHECKING:
     from segslam.gnss.geodesy import Origin

@@ -15,9 +15,9 @@ from segslam.core.config import RefineConfig
 from segslam.core.trajectory import Poses
 from segslam.output.log.records import codec
 from segslam.run.fleets.drives import key_of
-from segslam.slam.adjustment import Adjustment
 from segslam.slam.adjustment.alignment import Alignment
 from segslam.slam.adjustment.known import Compute, Guess
+from segslam.slam.adjustment.rounds import Adjustment
 
 unless_damaged = partial(whole_files.unless_damaged, remedy="remove it, and call `segslam fleet` again")
 

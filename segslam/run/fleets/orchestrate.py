@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from segslam.core.config import setting_texts
+from segslam.core.processes import Progress, no_progress
 from segslam.core.threads import Stopwatch
 from segslam.core.types import SegslamError, WorkFailed
 from segslam.core.whole_files import expanded, write_whole
@@ -22,7 +23,6 @@ from segslam.run.fleets.relations import Components
 from segslam.run.fleets.steps import Mapped
 from segslam.run.fleets.workers import Outcome, Workers, workers
 from segslam.run.sessions.session_pose import Relation
-from segslam.slam.adjustment import Progress, no_progress
 
 logger = logging.getLogger(__name__)
 

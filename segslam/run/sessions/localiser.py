@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from segslam.core.config import Config
+from segslam.core.processes import Progress, no_progress
 from segslam.core.threads import Stopwatch
 from segslam.core.trajectory import nearest_rows, travelled_m
 from segslam.core.types import REJECTED_WEIGHT, GraphEstimate, LoopAttempt, Placement, Rejected, Step, Vector
@@ -21,7 +22,6 @@ from segslam.registration.prepared import Labeller
 from segslam.run.locator import Locator
 from segslam.run.map_folder import SlamOf, map_folder
 from segslam.run.sessions.placer import Placer
-from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.slam import Slam, SlamResult
 
 

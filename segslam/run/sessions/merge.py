@@ -12,6 +12,7 @@ import numpy as np
 from segslam.candidates.places import OTHER_PLACE_M
 from segslam.core import geometry
 from segslam.core.config import Config, check_config
+from segslam.core.processes import Progress, no_progress
 from segslam.core.types import LoopAttempt, SegslamError, Step, Trajectory
 from segslam.core.whole_files import all_expanded, expanded
 from segslam.gnss import Use
@@ -24,7 +25,6 @@ from segslam.run.locator import Locator
 from segslam.run.run import Run
 from segslam.run.sessions.recorded import Session, SessionPose, Shift, known_of, read_sessions, shifted, shifted_steps
 from segslam.run.sessions.session_pose import Relation, attempt, find_session
-from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.adjustment.known import Kept, nothing_kept
 from segslam.slam.slam import Slam
 

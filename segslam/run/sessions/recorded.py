@@ -26,9 +26,8 @@ from segslam.core.types import (
 from segslam.output.finished import FinishedRun, read_corrections, read_run
 from segslam.output.folder import log_of
 from segslam.output.log import RunLog, read_log
-from segslam.slam.adjustment import Known
 from segslam.slam.adjustment.alignment import MIN_PAIRS
-from segslam.slam.adjustment.known import Kept, nothing_kept
+from segslam.slam.adjustment.known import Kept, Known, nothing_kept
 from segslam.slam.adjustment.sweeps import common_sweep
 from segslam.slam.adjustment.vertical_angle import VerticalAngle
 from segslam.slam.slam import SlamResult

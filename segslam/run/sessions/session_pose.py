@@ -13,13 +13,13 @@ import numpy as np
 from segslam.candidates.places import OTHER_PLACE_M
 from segslam.core import geometry
 from segslam.core.config import Config
+from segslam.core.processes import Progress, no_progress
 from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, Transform
 from segslam.graph import PoseGraph
 from segslam.graph.closure_pairs import largest_consistent
 from segslam.graph.confirmation import MIN_CONSISTENT
 from segslam.run.locator import Locator, submaps_of
 from segslam.run.sessions.recorded import FIRST_MOTION, Session, shifted
-from segslam.slam.adjustment import Progress, no_progress
 from segslam.slam.recognition import MAX_PLACES
 
 NUM_QUERIES = 60

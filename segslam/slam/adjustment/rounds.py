@@ -6,18 +6,18 @@ result shows the angle better, and another round corrects the scans by it.
 """
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import takewhile
 from time import monotonic
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import Config, RefineConfig
-from segslam.core.processes import in_parts
+from segslam.core.processes import Progress, in_parts, no_progress
 from segslam.core.trajectory import Poses
 from segslam.core.types import GraphEstimate, Record
 from segslam.graph import Edge, PoseGraph
@@ -36,8 +36,6 @@ SHARE = min(1.0, EVERY / (2 * REACH + 1))
 """Share of the information of a registration: a scan is in so many submaps."""
 MIN_OVERLAP = 0.1
 """Chosen on KITTI 00: smallest share of a submap's points that lie on the other."""
-Progress = Callable[[Iterable[Any], int, str], Iterator[Any]]
-"""Passes items on and shows progress: takes the items, their number, and a title."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -96,11 +94,6 @@ class Adjustment(Record):
             "adjustment_moved_m": self.moved_m,
         }
         return {name: value for name, value in figures.items() if value is not None}
-
-
-def no_progress(items: Iterable[Any], total: int, title: str) -> Iterator[Any]:
-    """Shows nothing."""
-    yield from items
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,11 +214,11 @@ def _rounds(
         aligned = of_drives or aligned_by(surface_of)
         pairs = all_pairs(T_world, travel_m, graph.covariances, min_travel_m=config.proximity.min_travel_m)
         title = f"refine {number}/{num_rounds}"
-        in_time = partial(_registered_until, end_s, aligned=aligned, T_world=T_world, config=refine)
+        register = partial(register_pairs, aligned=aligned, T_world=T_world, end_s=end_s, config=refine)
         if known:  # which keeps alignments in the memory of this process
-            tried = list(progress(in_time(pairs.tolist()), len(pairs), title))
+            tried = list(progress(register(pairs.tolist()), len(pairs), title))
         else:
-            tried = list(in_parts(pairs.tolist(), in_time, progress=progress, title=title))
+            tried = list(in_parts(pairs.tolist(), register, progress=progress, title=title))
         registered = [one for one in tried if one is not None]
         if not registered:
             break
@@ -240,19 +233,15 @@ def _rounds(
     return last
 
 
-def _registered_until(end_s: float, pairs: Sequence[Sequence[int]], **more: Any) -> Iterator[Edge | None]:
-    """As `register_pairs`, until a time of time.monotonic."""
-    return takewhile(lambda _: monotonic() < end_s, register_pairs(pairs, **more))
-
-
 def register_pairs(
-    pairs: Sequence[Sequence[int]], aligned: Aligned, T_world: Poses, *, config: RefineConfig
+    pairs: Sequence[Sequence[int]], aligned: Aligned, T_world: Poses, *, end_s: float, config: RefineConfig
 ) -> Iterator[Edge | None]:
     """Register each pair (target, source) from its current pose; None without convergence or enough overlap.
 
-    An edge has a share of its information, so that every scan counts once.
+    None is begun after `end_s`, a time of time.monotonic. An edge has a share of its information, so that every scan
+    counts once.
     """
-    for target_id, source_id in pairs:
+    for target_id, source_id in takewhile(lambda _: monotonic() < end_s, pairs):
         T_prior = geometry.inverse(T_world[target_id]) @ T_world[source_id]
         found = aligned(target_id, source_id, T_prior)
         if found is None or found.overlap < MIN_OVERLAP:

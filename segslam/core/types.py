@@ -9,6 +9,7 @@ Shapes are checked under pytest only.
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from enum import IntEnum, StrEnum
+from functools import partial
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
@@ -283,20 +284,22 @@ class Description(Record):
     Each is a Gaussian with a class. Thousands of descriptions fit in memory.
     """
 
-    means: Points
+    means: Points = field(default_factory=partial(np.empty, (0, 3)))
     """Centres; for upright objects above observed ground, the point on the ground below."""
-    covariances: Covariances
-    classes: Labels
-    sizes: Indices
+    covariances: Covariances = field(default_factory=partial(np.empty, (0, 3, 3)))
+    """Normalised by the number of points (m^2)."""
+    classes: Labels = field(default_factory=partial(np.empty, 0, np.uint8))
+    sizes: Indices = field(default_factory=partial(np.empty, 0, np.int64))
     """Points in each cluster."""
-    feature_points: Points
-    feature_covariances: Covariances
-    feature_classes: Labels
-    feature_descriptors: Float[np.ndarray, "_ 33"]
-    """Square roots of FPFH at unit length, float16."""
-    ground_points: Points = field(default_factory=lambda: np.empty((0, 3), np.float32))
+    feature_points: Points = field(default_factory=partial(np.empty, (0, 3), np.float32))
+    feature_covariances: Covariances = field(default_factory=partial(np.empty, (0, 3, 3), np.float32))
+    """Of the patch around each key point."""
+    feature_classes: Labels = field(default_factory=partial(np.empty, 0, np.uint8))
+    feature_descriptors: Float[np.ndarray, "_ 33"] = field(default_factory=partial(np.empty, (0, 33), np.float16))
+    """Square roots of FPFH at unit length."""
+    ground_points: Points = field(default_factory=partial(np.empty, (0, 3), np.float32))
     """Centres of flat patches of the ground, a row each."""
-    ground_normals: Points = field(default_factory=lambda: np.empty((0, 3), np.float32))
+    ground_normals: Points = field(default_factory=partial(np.empty, (0, 3), np.float32))
     """Unit normals of the patches, towards the sensor."""
 
 

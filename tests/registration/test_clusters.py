@@ -10,10 +10,9 @@ from helpers.real_scans import raw_scan
 from segslam.core import geometry
 from segslam.core.config import SegregatorConfig, load_config
 from segslam.core.points import group_moments
-from segslam.core.types import Label
+from segslam.core.types import Description, Label
 from segslam.registration.segregator.clusters import (
     DCVC_AZIMUTH_DEG,
-    Clusters,
     curved_voxel_clusters,
     semantic_clusters,
 )
@@ -46,7 +45,11 @@ def golden(data_dir: Path, scan: int, name: str) -> tuple[np.ndarray, np.ndarray
     return centroids, covariances.reshape(-1, 3, 3), sizes[:, 0].astype(int)
 
 
-def equal_rows(clusters: Clusters, means: np.ndarray, covariances: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+def columns(clusters: Description) -> tuple[np.ndarray, ...]:
+    return clusters.means, clusters.covariances, clusters.classes, clusters.sizes
+
+
+def equal_rows(clusters: Description, means: np.ndarray, covariances: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Whether each given Gaussian is among the clusters: the same number of points, and to float32 the same moments.
 
     Their program keeps centres as float32: 4e-6 m at 60 m, and 1e-4 leaves room.
@@ -57,8 +60,8 @@ def equal_rows(clusters: Clusters, means: np.ndarray, covariances: np.ndarray, s
     return near & alike & (clusters.sizes[nearest] == sizes)
 
 
-def of_class(clusters: Clusters, label: Label) -> Clusters:
-    return Clusters(*(column[clusters.classes == label] for column in clusters))
+def of_class(clusters: Description, label: Label) -> Description:
+    return Description(*(column[clusters.classes == label] for column in columns(clusters)))
 
 
 def scattered(rng: np.random.Generator, num_points: int, num_clumps: int) -> np.ndarray:
@@ -95,7 +98,7 @@ def test_what_the_authors_program_splits_depends_on_the_order_of_its_points(data
     twin = group_moments(points[kept].astype(float), np.searchsorted(large, theirs[kept]), len(large))
     means, covariances, sizes = golden(data_dir, scan, name)
     assert len(large) == len(means)
-    assert equal_rows(Clusters(*twin, np.empty(0, np.uint8), counts[large]), means, covariances, sizes).all()
+    assert equal_rows(Description(*twin, np.empty(0, np.uint8), counts[large]), means, covariances, sizes).all()
     assert len(np.unique(np.column_stack([theirs, ours]), axis=0)) == len(np.unique(theirs))
 
 
@@ -140,8 +143,8 @@ def test_the_order_of_points_changes_nothing(data_dir) -> None:
     points, labels = raw_scan(data_dir, 0)
     order = np.random.default_rng(2).permutation(len(points))
     for column, permuted in zip(
-        semantic_clusters(points, labels, config=CONFIG),
-        semantic_clusters(points[order], labels[order], config=CONFIG),
+        columns(semantic_clusters(points, labels, config=CONFIG)),
+        columns(semantic_clusters(points[order], labels[order], config=CONFIG)),
         strict=True,
     ):
         np.testing.assert_array_equal(column, permuted)
@@ -155,8 +158,9 @@ def test_points_out_of_range_of_no_number_or_of_other_classes_change_nothing(dat
     added = semantic_clusters(
         np.concatenate([strange.astype(np.float32), points]), np.concatenate([others, labels]), config=CONFIG
     )
-    for column, before in zip(added, semantic_clusters(points, labels, config=CONFIG), strict=True):
-        np.testing.assert_array_equal(column, before)
+    before = columns(semantic_clusters(points, labels, config=CONFIG))
+    for column, one in zip(columns(added), before, strict=True):
+        np.testing.assert_array_equal(column, one)
 
 
 @pytest.mark.parametrize("beam_deg", [0.4, 2.0])

@@ -6,9 +6,9 @@ from helpers.real_scans import PREDICTED, raw_scan
 
 from segslam.core import geometry
 from segslam.core.config import SegregatorConfig
-from segslam.core.types import Label
+from segslam.core.types import Description, Label
 from segslam.registration.segregator import describe
-from segslam.registration.segregator.clusters import MAX_RANGE_M, Clusters
+from segslam.registration.segregator.clusters import MAX_RANGE_M
 from segslam.registration.segregator.describe import ground_cells, stand_on_ground
 
 UPRIGHT = SegregatorConfig().foot_classes
@@ -23,9 +23,11 @@ def cells(points: np.ndarray) -> np.ndarray:
     return ground_cells(points, np.full(len(points), Label.ROAD, np.uint8))
 
 
-def clusters_at(means: np.ndarray) -> Clusters:
+def clusters_at(means: np.ndarray) -> Description:
     count = len(means)
-    return Clusters(means, np.tile(np.eye(3), (count, 1, 1)), np.full(count, Label.POLE, np.uint8), np.full(count, 9))
+    return Description(
+        means, np.tile(np.eye(3), (count, 1, 1)), np.full(count, Label.POLE, np.uint8), np.full(count, 9)
+    )
 
 
 def test_upright_clusters_stand_on_the_ground_beneath_and_others_stay() -> None:

@@ -11,7 +11,6 @@ the order of the points.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -20,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from segslam.core import geometry
 from segslam.core.config import SegregatorConfig
 from segslam.core.points import canonical_order, group_moments, within_range
-from segslam.core.types import Covariances, Indices, Label, Labels, Points, Vector
+from segslam.core.types import Covariances, Description, Indices, Label, Labels, Points, Vector
 
 DCVC_START_RADIUS_M = 0.35
 """Authors: depth of the first radial bin of DCVC before it shrinks (m)."""
@@ -37,21 +36,14 @@ FIRST_RADIUS_M = 5.0
 """Start of the first radial bin, or the nearest point of the class if that is nearer (the authors' program) (m)."""
 
 
-class Clusters(NamedTuple):
-    """Gaussians, a row each: centre (m), covariance (m^2, normalised by n), class, number of points."""
-
-    means: Points
-    covariances: Covariances
-    classes: Labels
-    sizes: Indices
+Gaussians = tuple[Points, Covariances, Labels, Indices]
+"""The columns of clusters in a description."""
 
 
-NO_CLUSTERS = Clusters(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0, np.uint8), np.empty(0, np.int64))
+def semantic_clusters(points: Points, labels: Labels, *, config: SegregatorConfig) -> Description:
+    """Description of the clusters alone, for each class in `config.cluster_min_points`.
 
-
-def semantic_clusters(points: Points, labels: Labels, *, config: SegregatorConfig) -> Clusters:
-    """The clusters of each class in `config.cluster_min_points`, by class, then by visible surface, largest first.
-
+    They are sorted by class, then by visible surface, largest first.
     The visible surface is proportional to the number of points times the squared range. The first
     `config.max_clusters_per_class` clusters of each class are kept.
     Centres are in the frame of `points`, whose origin is the sensor. Points that are NaN or out of range are ignored.
@@ -65,7 +57,7 @@ def semantic_clusters(points: Points, labels: Labels, *, config: SegregatorConfi
         _class_clusters(points[labels == label], label, min_points, config)
         for label, min_points in sorted(config.cluster_min_points.items())
     ]
-    return Clusters(*(np.concatenate(columns) for columns in zip(NO_CLUSTERS, *parts, strict=True)))
+    return Description(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def curved_voxel_clusters(points: Points, *, pitch_deg: float) -> Indices:
@@ -89,7 +81,7 @@ def curved_voxel_clusters(points: Points, *, pitch_deg: float) -> Indices:
     return _components(keys, num_radial, num_azimuth)[voxel]
 
 
-def _class_clusters(points: Points, label: Label, min_points: int, config: SegregatorConfig) -> Clusters:
+def _class_clusters(points: Points, label: Label, min_points: int, config: SegregatorConfig) -> Gaussians:
     cluster = curved_voxel_clusters(points, pitch_deg=config.dcvc_pitch_deg)
     sizes = np.bincount(cluster)
     large = sizes >= min_points
@@ -98,7 +90,7 @@ def _class_clusters(points: Points, label: Label, min_points: int, config: Segre
     means, covariances = group_moments(points[kept], renumbered[cluster[kept]], int(large.sum()))
     area = sizes[large] * (means**2).sum(axis=1)
     order = np.lexsort((*means.T, -area))[: config.max_clusters_per_class]
-    return Clusters(means[order], covariances[order], np.full(len(order), label, np.uint8), sizes[large][order])
+    return means[order], covariances[order], np.full(len(order), label, np.uint8), sizes[large][order]
 
 
 def _nearest_bin(values: Vector, width: float) -> Indices:

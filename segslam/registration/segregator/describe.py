@@ -17,16 +17,15 @@ error of real pairs 9 to 35 m apart is 0.1 instead of 0.2 degrees.
 """
 
 import math
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial import cKDTree
 
 from segslam.core.config import SegregatorConfig
 from segslam.core.points import group_means, normals, patch_covariances, radius_neighbours, voxel_means, within_range
-from segslam.core.types import GROUND_LABELS, Covariances, Description, Indices, Label, Labels, Mask, Points
-from segslam.registration.segregator.clusters import MAX_RANGE_M, MIN_RANGE_M, Clusters, semantic_clusters
+from segslam.core.types import GROUND_LABELS, Description, Indices, Label, Labels, Mask, Points
+from segslam.registration.segregator.clusters import MAX_RANGE_M, MIN_RANGE_M, semantic_clusters
 from segslam.registration.segregator.fpfh import fpfh
 
 FEW_CLUSTERS = 24
@@ -59,23 +58,6 @@ RESOLUTION_M = 1e-4
 """Unit of the integer sums of coordinates (m)."""
 
 
-class Features(NamedTuple):
-    """Key points, a row each: position (m), covariance of the patch (m^2), class, descriptor of unit length.
-
-    float32, the descriptors float16.
-    """
-
-    points: Points
-    covariances: Covariances
-    classes: Labels
-    descriptors: Float[np.ndarray, "_ 33"]
-
-
-NO_FEATURES = Features(
-    np.empty((0, 3), np.float32), np.empty((0, 3, 3), np.float32), np.empty(0, np.uint8), np.empty((0, 33), np.float16)
-)
-
-
 def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Description:
     """The semantic clusters, point features and ground of a scan, in its frame, whose origin is the sensor.
 
@@ -86,19 +68,19 @@ def describe(points: Points, labels: Labels, *, config: SegregatorConfig) -> Des
         raise ValueError(f"points of shape {points.shape}; give a row x, y, z for each")
     if len(points) != len(labels):
         raise ValueError(f"{len(points)} points but {len(labels)} labels; give one label for each point")
-    clusters = semantic_clusters(points, labels, config=config)
-    upright = np.isin(clusters.classes, [int(label) for label in config.foot_classes])
+    description = semantic_clusters(points, labels, config=config)
+    upright = np.isin(description.classes, [int(label) for label in config.foot_classes])
     if upright.any():
-        clusters = stand_on_ground(clusters, upright, ground_cells(points, labels))
-    wanted = config.features == "always" or (
-        config.features == "when_few_clusters" and len(clusters.sizes) < FEW_CLUSTERS
-    )
-    features = point_features(points, labels, config=config) if wanted else NO_FEATURES
-    return Description(*clusters, *features, *ground_patches(points, labels))
+        description = stand_on_ground(description, upright, ground_cells(points, labels))
+    is_poor = config.features == "when_few_clusters" and len(description.sizes) < FEW_CLUSTERS
+    if config.features == "always" or is_poor:
+        description = replace(description, **point_features(points, labels, config=config))
+    centres, normals = ground_patches(points, labels)
+    return replace(description, ground_points=centres, ground_normals=normals)
 
 
-def point_features(points: Points, labels: Labels, *, config: SegregatorConfig) -> Features:
-    """The key points of each class in `FEATURE_CLASSES`, in the frame of `points`; the sensor is at its origin.
+def point_features(points: Points, labels: Labels, *, config: SegregatorConfig) -> dict[str, np.ndarray]:
+    """The key points of each class in `FEATURE_CLASSES`, as fields of a description; the sensor is at the origin.
 
     Points that are NaN or out of range are ignored. The result does not depend on the order of the points.
     """
@@ -109,10 +91,10 @@ def point_features(points: Points, labels: Labels, *, config: SegregatorConfig) 
         cloud = voxel_means(cloud, config.feature_voxel_m)
         nearest = np.argsort(np.linalg.norm(cloud, axis=1), kind="stable")[:MAX_CLOUD_POINTS]
         parts.append(_class_features(cloud[np.sort(nearest)], int(label), config))
-    return Features(*(np.concatenate(columns) for columns in zip(NO_FEATURES, *parts, strict=True)))
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _class_features(cloud: Points, label: int, config: SegregatorConfig) -> Features:
+def _class_features(cloud: Points, label: int, config: SegregatorConfig) -> dict[str, np.ndarray]:
     """The key points of one class from its voxelised cloud; none if no point has enough neighbours."""
     patches = radius_neighbours(cloud, config.normal_radius_m)
     kept = patches.ends - patches.starts >= MIN_PATCH_POINTS
@@ -121,15 +103,16 @@ def _class_features(cloud: Points, label: int, config: SegregatorConfig) -> Feat
     around = radius_neighbours(cloud, config.feature_radius_m)
     chosen = np.sort(np.argsort(around.starts - around.ends, kind="stable")[: config.max_features_per_class])
     histograms = fpfh(cloud, normals(cloud, covariances), around, chosen)
-    return Features(
-        points=cloud[chosen].astype(np.float32),
-        covariances=covariances[chosen].astype(np.float32),
-        classes=np.full(len(chosen), label, np.uint8),
-        descriptors=np.sqrt(histograms / np.maximum(histograms.sum(axis=1, keepdims=True), 1.0)).astype(np.float16),
-    )
+    unit = np.sqrt(histograms / np.maximum(histograms.sum(axis=1, keepdims=True), 1.0))
+    return {
+        "feature_points": cloud[chosen].astype(np.float32),
+        "feature_covariances": covariances[chosen].astype(np.float32),
+        "feature_classes": np.full(len(chosen), label, np.uint8),
+        "feature_descriptors": unit.astype(np.float16),
+    }
 
 
-def stand_on_ground(clusters: Clusters, upright: Mask, ground: Points) -> Clusters:
+def stand_on_ground(clusters: Description, upright: Mask, ground: Points) -> Description:
     """The clusters, with the `upright` ones moved along z to the ground around them: the median of the nearest cells.
 
     `ground` comes from `ground_cells`, in the clusters' frame. A cluster without ground within `FOOT_MAX_DISTANCE_M`
@@ -142,7 +125,7 @@ def stand_on_ground(clusters: Clusters, upright: Mask, ground: Points) -> Cluste
     moved = upright & (distances[:, 0] <= FOOT_MAX_DISTANCE_M)
     means = clusters.means.copy()
     means[moved, 2] = np.median(ground[nearest[moved], 2], axis=1)
-    return clusters._replace(means=means)
+    return replace(clusters, means=means)
 
 
 def ground_cells(points: Points, labels: Labels) -> Points:

@@ -4,7 +4,7 @@ Tangents are [rotation rad; translation m]; `exp` and `log` are those of SE(3), 
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -106,16 +106,11 @@ def interpolate(T_w_a: Transform, T_w_b: Transform, fraction: float) -> Transfor
     return T_w_a @ exp(fraction * log(inverse(T_w_a) @ T_w_b))
 
 
-def with_noise(information: Information, *, rotation_rad: Triple, translation_m: Triple) -> Information:
-    """The information of a tangent after adding independent noise with these standard deviations.
+def with_covariance(information: Information, noise: Information) -> Information:
+    """The information of a tangent after adding independent noise of this covariance.
 
     Inverse(inverse(I) + S), computed so that I may be singular: unknown directions stay unknown.
     """
-    return with_covariance(information, np.diag(tangent(rotation_rad=rotation_rad, translation_m=translation_m) ** 2))
-
-
-def with_covariance(information: Information, noise: Information) -> Information:
-    """The information of a tangent after adding independent noise of this covariance; as `with_noise`."""
     total = np.linalg.solve(np.eye(6) + information @ noise, information)
     return (total + total.T) / 2
 
@@ -175,12 +170,6 @@ def raising(points: Points) -> Points:
     horizontal = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
     x, y, z = points.T
     return np.column_stack([-z * x / horizontal, -z * y / horizontal, horizontal])
-
-
-def is_near(T: Transform, others: Iterable[Transform], *, within_m: float, within_rad: float) -> bool:
-    """True if a pose is close to one of the others in the same frame."""
-    apart = [inverse(other) @ T for other in others]
-    return any(distance(one) < within_m and angle(one) < within_rad for one in apart)
 
 
 def chance_beyond(reach_m: float, covariance: Information) -> float:

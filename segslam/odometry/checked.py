@@ -32,13 +32,11 @@ from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel
 from segslam.odometry.search import PoseSearch, Recover
 from segslam.odometry.sweep import Foreseeing, Odometry, OdometryResult
-from segslam.registration.refinement import SHARED_NOISE_DEG, SHARED_NOISE_M
+from segslam.registration.refinement import SHARED_NOISE
 
 ELSEWHERE_M = 30.0
 ANYWHERE = geometry.tangent(rotation_rad=np.radians(60.0), translation_m=ELSEWHERE_M)
 """Chosen: standard deviations of a motion that no pose explains: the sensor may have been carried anywhere nearby."""
-SHARED = np.diag(geometry.tangent(rotation_rad=math.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M) ** 2)
-"""Covariance of the errors that all points of a scan have in common."""
 MOST_OFF = float(chdtri(6, SIGNIFICANT))
 """Chi-square above which a pose of the odometry is significantly off the registered one."""
 MOST_OFF_TOGETHER = float(chdtri(6 * WINDOW, SIGNIFICANT))
@@ -337,7 +335,7 @@ class CheckedOdometry:
 
     def _covariance(self, fit: Fit) -> Information:
         """Covariance of a registered pose: of its likelihood, `ANYWHERE` at most, and of errors of all points."""
-        return np.linalg.inv(fit.information + np.diag(ANYWHERE**-2.0)) + SHARED
+        return np.linalg.inv(fit.information + np.diag(ANYWHERE**-2.0)) + SHARED_NOISE
 
     def _result(
         self, state: MotionState, T_map_proposed: Transform, fit: Fit, covariance: Information | None
@@ -358,7 +356,7 @@ class CheckedOdometry:
     def _own_information(self, covariance: Information) -> Information | None:
         """Information of a motion that is less certain than the graph's noise model of odometry; else None."""
         step = geometry.transform(np.eye(3), np.array([self._config.keyframes.distance_m, 0.0, 0.0]))
-        model = np.linalg.inv(odometry_information(0.0, step, self._config.graph)) + SHARED
+        model = np.linalg.inv(odometry_information(0.0, step, self._config.graph)) + SHARED_NOISE
         whiten = np.diag(np.diag(model) ** -0.5)
         excess, directions = np.linalg.eigh(whiten @ (covariance - model) @ whiten)
         if excess[-1] <= 0.0:

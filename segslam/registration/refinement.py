@@ -42,6 +42,8 @@ SHARED_NOISE_M = 0.026
 """Measured (simulated truth): translation noise common to all points, for example from sensor calibration (m)."""
 SHARED_NOISE_DEG = 0.067
 """Measured (simulated truth): rotation noise common to all points (degrees)."""
+SHARED_NOISE = np.diag(geometry.tangent(rotation_rad=math.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M) ** 2)
+"""Covariance of the errors that all points of a scan have in common."""
 
 NUM_NEIGHBOURS = 10
 """Number of neighbours for the covariance of a point; small_gicp's default."""
@@ -228,7 +230,8 @@ def refine(
 
 def is_near(T_target_source: Transform, T_target_others: Sequence[Transform]) -> bool:
     """True if a pose is the same as another of these."""
-    return geometry.is_near(T_target_source, T_target_others, within_m=SAME_POSE_M, within_rad=SAME_POSE_RAD)
+    apart = [geometry.inverse(other) @ T_target_source for other in T_target_others]
+    return any(geometry.distance(one) < SAME_POSE_M and geometry.angle(one) < SAME_POSE_RAD for one in apart)
 
 
 def approach(source: Surface, target: Surface, T_target_source: Transform, *, config: RefineConfig) -> Transform:
@@ -289,9 +292,7 @@ def limited_information(hessian: Information, *, config: RefineConfig) -> Inform
 
     It has no spurious information along smooth surfaces.
     """
-    information = geometry.with_noise(
-        hessian, rotation_rad=math.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M
-    )
+    information = geometry.with_covariance(hessian, SHARED_NOISE)
     ratio, direction = observability(information)
     if ratio >= UNOBSERVED:
         return information

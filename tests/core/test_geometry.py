@@ -74,14 +74,14 @@ def test_noise_adds_to_the_covariance(seed: int) -> None:
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(6, 6))
     covariance = root @ root.T + 0.1 * np.eye(6)
-    noisier = geometry.with_noise(np.linalg.inv(covariance), rotation_rad=0.2, translation_m=[1.0, 2.0, 3.0])
-    expected = covariance + np.diag(np.array([0.2, 0.2, 0.2, 1.0, 2.0, 3.0]) ** 2)
-    np.testing.assert_allclose(np.linalg.inv(noisier), expected, atol=1e-9)
+    noise = np.diag(geometry.tangent(rotation_rad=0.2, translation_m=[1.0, 2.0, 3.0]) ** 2)
+    noisier = geometry.with_covariance(np.linalg.inv(covariance), noise)
+    np.testing.assert_allclose(np.linalg.inv(noisier), covariance + noise, atol=1e-9)
 
 
 def test_what_was_unknown_stays_unknown_under_noise() -> None:
     known = np.diag([4.0, 0.0, 4.0, 4.0, 0.0, 4.0])
-    noisier = geometry.with_noise(known, rotation_rad=0.5, translation_m=0.5)
+    noisier = geometry.with_covariance(known, 0.25 * np.eye(6))
     np.testing.assert_allclose(noisier, np.diag([2.0, 0.0, 2.0, 2.0, 0.0, 2.0]), atol=1e-12)
 
 

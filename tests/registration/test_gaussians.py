@@ -126,7 +126,7 @@ def test_shared_noise_bounds_what_the_information_claims_of_the_translation(
     source = scan(trees(4, count=60), flat_ground())
     sigma = {}
     for noise_m in (0.0, 0.5):
-        monkeypatch.setattr(gaussians, "SHARED_NOISE_M", noise_m)
+        monkeypatch.setattr(gaussians, "SHARED_NOISE", np.diag([0.0, 0.0, 0.0, *[noise_m**2] * 3]))
         fit = align(source, source, np.eye(4), SegregatorConfig())
         sigma[noise_m] = np.sqrt(np.diagonal(np.linalg.inv(fit.information)))
     assert np.allclose(sigma[0.5][:3], sigma[0.0][:3], rtol=1e-6)

@@ -184,8 +184,7 @@ def test_first_hypothesis_is_the_match() -> None:
 
 def test_information_predicts_the_scatter_of_the_pose(monkeypatch: pytest.MonkeyPatch) -> None:
     """Centroids of both scans are moved by the noise that the model claims; xi^T information xi is then chi-square."""
-    monkeypatch.setattr(gaussians, "SHARED_NOISE_M", 0.0)
-    monkeypatch.setattr(gaussians, "SHARED_NOISE_DEG", 0.0)
+    monkeypatch.setattr(gaussians, "SHARED_NOISE", np.zeros((6, 6)))
     config = SegregatorConfig()
     scan = street(8)
     moved_scan = moved(T_TRUE, scan)

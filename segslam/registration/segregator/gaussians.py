@@ -36,6 +36,7 @@ SHARED_NOISE_M = 0.045
 """Measured (simulated truth): noise common to all centroids, in the information matrix only (m)."""
 SHARED_NOISE_DEG = 0.05
 """Measured (simulated truth): rotation noise common to all centroids, for example from sensor calibration (degrees)."""
+SHARED_NOISE = np.diag(geometry.tangent(rotation_rad=math.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M) ** 2)
 
 MAX_ROUNDS = 8
 GROUND_REACH_M = 4.0
@@ -79,9 +80,7 @@ def align_gaussians(
         num_correspondences=len(correspondences.source),
         num_inliers=len(rows),
         rms_m=float(np.sqrt(np.mean(np.sum(gaps**2, axis=1)))),
-        information=geometry.with_noise(
-            information, rotation_rad=math.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M
-        ),
+        information=geometry.with_covariance(information, SHARED_NOISE),
     )
 
 

@@ -5,7 +5,7 @@ class count; moving classes count as their static class.
 """
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import median_low
 from time import perf_counter
@@ -113,7 +113,7 @@ class Tally:
             "accuracy": float(np.trace(counts) / counts.sum()),
             "mean_iou": float(np.mean(known)),
             "iou": by_class,
-            "iou_of_groups": group_scores(counts),
+            "iou_of_groups": scores(counts, GROUPS),
             "confusions": [
                 {"truth": true.name.lower(), "label": given.name.lower(), "share": share}
                 for true, given, share in largest_confusions(counts, 6)
@@ -190,23 +190,18 @@ def confusion(labels: Labels, truth: Labels) -> Confusion:
 def class_scores(counts: Confusion) -> dict[str, float]:
     """IoU of each class that occurs in the ground truth or in the labels, the most frequent first."""
     classes = sorted(list(Label)[1:NUM_CLASSES], key=lambda label: -counts[label].sum())
-    return _scores(counts, ((label.name.lower(), (label,)) for label in classes))
+    return scores(counts, {label.name.lower(): (label,) for label in classes})
 
 
-def group_scores(counts: Confusion) -> dict[str, float]:
-    """IoU of the groups of classes that matter for loop closing."""
-    return _scores(counts, GROUPS.items())
-
-
-def _scores(counts: Confusion, groups: Iterable[tuple[str, tuple[Label, ...]]]) -> dict[str, float]:
+def scores(counts: Confusion, groups: Mapping[str, tuple[Label, ...]]) -> dict[str, float]:
     """IoU of each of these groups that occurs."""
-    scores = {}
-    for name, members in groups:
+    found = {}
+    for name, members in groups.items():
         chosen = list(members)
         both = counts[np.ix_(chosen, chosen)].sum()
         if either := counts[chosen].sum() + counts[:, chosen].sum() - both:
-            scores[name] = float(both / either)
-    return scores
+            found[name] = float(both / either)
+    return found
 
 
 def largest_confusions(counts: Confusion, count: int) -> list[tuple[Label, Label, float]]:

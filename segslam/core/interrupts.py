@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from traceback import walk_stack
 from types import FrameType
 from typing import Any, ClassVar
 
@@ -81,7 +82,8 @@ def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[di
 
 def _interrupt(_: int, frame: FrameType | None) -> None:
     _State.times += 1
-    if _State.times > PATIENCE or _is_importing(frame):
+    is_importing = any(one.f_code.co_filename.startswith("<frozen importlib") for one, _ in walk_stack(frame))
+    if _State.times > PATIENCE or is_importing:
         _remove_unfinished()
         os.write(2, f"{stop_line()}\n".encode())
         os._exit(EXIT_STATUS)
@@ -96,14 +98,6 @@ def _remove_unfinished() -> None:
                 shutil.rmtree(path, ignore_errors=True)
             else:
                 path.unlink(missing_ok=True)
-
-
-def _is_importing(frame: FrameType | None) -> bool:
-    while frame is not None:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
-            return True
-        frame = frame.f_back
-    return False
 
 
 @contextmanager

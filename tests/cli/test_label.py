@@ -11,7 +11,7 @@ from helpers.commands import run
 from helpers.drives import write_kitti_sequence
 from helpers.made_networks import class_network
 
-from segslam.bench.labelling import STILL, Tally, class_scores, confusion, group_scores, largest_confusions
+from segslam.bench.labelling import GROUPS, STILL, Tally, class_scores, confusion, largest_confusions, scores
 from segslam.core.types import Label
 from segslam.labels.encodings import RAW_OF_LABEL, Encoding, of_classes, to_labels
 from segslam.labels.label_files import read_ids, read_labels
@@ -220,14 +220,14 @@ def test_scores_are_intersections_over_unions_of_the_points_whose_class_is_known
     counts = confusion(labels, truth)
     given, true = STILL[labels][truth > 0], STILL[truth][truth > 0]
     assert Label(int(STILL[Label.MOVING_CAR])) == Label.CAR
-    scores = class_scores(counts)
-    assert len(scores) == 19
+    by_class = class_scores(counts)
+    assert len(by_class) == 19
     for label in list(Label)[1:20]:
         expected = ((given == label) & (true == label)).sum() / ((given == label) | (true == label)).sum()
-        assert scores[label.name.lower()] == pytest.approx(expected)
+        assert by_class[label.name.lower()] == pytest.approx(expected)
     upright = [Label.TRUNK, Label.POLE]
     both, either = np.isin(given, upright) & np.isin(true, upright), np.isin(given, upright) | np.isin(true, upright)
-    assert group_scores(counts)["trunk_or_pole"] == pytest.approx(both.sum() / either.sum())
+    assert scores(counts, GROUPS)["trunk_or_pole"] == pytest.approx(both.sum() / either.sum())
     right, wrong, share = largest_confusions(counts, 1)[0]
     assert share == pytest.approx(((true == right) & (given == wrong)).mean())
     assert right != wrong

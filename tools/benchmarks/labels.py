@@ -21,7 +21,7 @@ from segslam.bench.experiments.job import open_once, points_of
 from segslam.bench.experiments.methods import find_method
 from segslam.bench.experiments.pairs import PairList, Trial, cut_pairs, pair_trials
 from segslam.bench.experiments.rows import Row, figures, grouped
-from segslam.bench.labelling import confusion, group_scores
+from segslam.bench.labelling import GROUPS, confusion, scores
 from segslam.core.config import Config, load_config
 from segslam.core.types import Label, Points, Trajectory
 from segslam.labels import geometric_labels
@@ -46,7 +46,7 @@ def class_agreement(data: Path) -> dict[str, dict[str, float]]:
     }
     counts["all"] = np.sum(list(counts.values()), axis=0)
     return {
-        scans: {name: round(score, 3) for name, score in group_scores(of_scans).items()}
+        scans: {name: round(score, 3) for name, score in scores(of_scans, GROUPS).items()}
         for scans, of_scans in counts.items()
     }
 

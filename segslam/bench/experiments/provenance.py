@@ -56,7 +56,9 @@ def account(
     experiment: str, job: Job, lists: Sequence[PairList], results: dict[str, Any], *, options: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Content of `report.json`: what was measured, under which conditions, and the results."""
-    simulation = _simulation(job)
+    data = job.source.data
+    files = [folder / SETTINGS_FILE for folder in (data, data / "sequences" / job.source.sequence.zfill(2))]
+    simulation = next((json.loads(file.read_text(encoding="utf-8")) for file in files if file.is_file()), None)
     return {
         "experiment": experiment,
         "data": f"{job.source.dataset or 'kitti'} {job.source.sequence}",
@@ -72,15 +74,6 @@ def account(
         "settings": job.config.model_dump(mode="json"),
         "results": results,
     }
-
-
-def _simulation(job: Job) -> dict[str, Any] | None:
-    """Seed and settings of the simulator that made the scans; None if they are real."""
-    data = job.source.data
-    for folder in (data, data / "sequences" / job.source.sequence.zfill(2)):
-        if (folder / SETTINGS_FILE).is_file():
-            return json.loads((folder / SETTINGS_FILE).read_text(encoding="utf-8"))
-    return None
 
 
 def _notes(simulation: dict[str, Any] | None, lists: Sequence[PairList], labels: str) -> list[str]:

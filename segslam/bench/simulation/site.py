@@ -28,13 +28,6 @@ class Route:
     travel_m: Vector
 
 
-def route_of(T_world_lidar: Poses, time_s: Vector, *, sensor_height_m: float) -> Route:
-    """The road below the sensor."""
-    at = T_world_lidar[:, :3, 3] - np.array([0.0, 0.0, sensor_height_m])
-    steps = np.linalg.norm(np.diff(at[:, :2], axis=0), axis=1)
-    return Route(at, np.asarray(time_s, dtype=np.float64), np.concatenate([[0.0], np.cumsum(steps)]))
-
-
 def street_of(route: Route, T_world_lidar: Poses) -> Points:
     """(n, 3) the route at steps of at most 1 m, with the street extended straight at both ends."""
     length = route.travel_m[-1]

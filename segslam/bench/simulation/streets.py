@@ -32,7 +32,11 @@ class Lot:
 
 def furnish(site: Site, frontage: Frontage, config: WorldConfig, rng: np.random.Generator) -> Iterator[Mesh]:
     """All objects on one side, in the world frame: houses first, then objects that fit in front of them."""
-    for lot in _lots(site, frontage, rng):
+    start = 0
+    while start < len(frontage.at):
+        width = int(rng.integers(9, 25))
+        lot = Lot(site, frontage, min(start + width // 2, len(frontage.at) - 1), float(width))
+        start += width
         if rng.uniform() < config.built:
             yield from _house(lot, rng)
             yield from _shrubs(lot, YARD_SHRUBS * config.shrubs, YARD_M, rng)
@@ -57,15 +61,6 @@ def furnish(site: Site, frontage: Frontage, config: WorldConfig, rng: np.random.
             thing = make(rng)
             if site.claim(spot, 0.5, 0.5, clearance_m=3.0):
                 yield site.stand(thing, spot, turn_rad=float(rng.normal(scale=0.05)))
-
-
-def _lots(site: Site, frontage: Frontage, rng: np.random.Generator) -> Iterator[Lot]:
-    """Consecutive lots, 9-24 m wide."""
-    start = 0
-    while start < len(frontage.at):
-        width = int(rng.integers(9, 25))
-        yield Lot(site, frontage, min(start + width // 2, len(frontage.at) - 1), float(width))
-        start += width
 
 
 def _house(lot: Lot, rng: np.random.Generator) -> Iterator[Mesh]:

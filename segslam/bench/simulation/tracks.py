@@ -161,8 +161,11 @@ def level_revisits(T_world_lidar: Poses) -> Poses:
     path = np.column_stack([np.interp(stations, travel, values) for values in (*positions[:, :2].T, climb)])
     raise_m = _smoothest_raise(path)
     slope = np.gradient(raise_m, STATION_M) if len(stations) > 1 else np.zeros(1)
-    heights = climb + np.interp(travel, stations, raise_m)
-    return _raised(T_world_lidar, heights, np.interp(travel, stations, slope))
+    left = geometry.unit_rows(np.cross([0.0, 0.0, 1.0], T_world_lidar[:, :3, 0]))
+    pitches = -np.arctan(np.interp(travel, stations, slope))
+    turns = ScipyRotation.from_rotvec(pitches[:, None] * left).as_matrix()
+    at = np.column_stack([positions[:, :2], climb + np.interp(travel, stations, raise_m)])
+    return geometry.transforms(turns @ T_world_lidar[:, :3, :3], at)
 
 
 def _smoothest_raise(path: np.ndarray) -> Vector:
@@ -194,12 +197,3 @@ def _ties(path_xy: np.ndarray) -> csr_array:
     columns = np.concatenate([late, early, early + 1])
     values = np.concatenate([np.ones(len(share)), share - 1.0, -share])
     return csr_array((values, (np.tile(row, 3), columns)), shape=(len(share), len(path_xy)))
-
-
-def _raised(T_world_lidar: Poses, heights: Vector, slope: Vector) -> Poses:
-    """Each pose moved to its height and pitched about its left axis, so that the slope increases by `slope`."""
-    forward = T_world_lidar[:, :3, 0]
-    left = geometry.unit_rows(np.cross([0.0, 0.0, 1.0], forward))
-    turns = ScipyRotation.from_rotvec(-np.arctan(slope)[:, None] * left).as_matrix()
-    at = np.column_stack([T_world_lidar[:, :2, 3], heights])
-    return geometry.transforms(turns @ T_world_lidar[:, :3, :3], at)

@@ -7,7 +7,7 @@ import open3d as o3d
 
 from segslam.bench.simulation.cars import MovingCar, ParkedCar, meshes_at, moving_cars, parked_cars
 from segslam.bench.simulation.mesh import Flags, Instances, Mesh, as_instance, join_meshes
-from segslam.bench.simulation.site import Route, Site, frontages, route_of, street_of
+from segslam.bench.simulation.site import Route, Site, frontages, street_of
 from segslam.bench.simulation.streets import furnish
 from segslam.bench.simulation.terrain import Terrain, ground_mesh, ground_of
 from segslam.bench.simulation.world_settings import WorldConfig
@@ -66,7 +66,9 @@ def build_world(T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, se
     `config.day` the streets are the same, but parked and moving cars differ.
     """
     rng = np.random.default_rng([seed, 1])
-    route = route_of(T_world_lidar, time_s, sensor_height_m=config.sensor_height_m)
+    at = T_world_lidar[:, :3, 3] - np.array([0.0, 0.0, config.sensor_height_m])
+    steps = np.linalg.norm(np.diff(at[:, :2], axis=0), axis=1)
+    route = Route(at, np.asarray(time_s, dtype=np.float64), np.concatenate([[0.0], np.cumsum(steps)]))
     street = street_of(route, T_world_lidar)
     ground = ground_of(street, rng)
     site = Site(ground)

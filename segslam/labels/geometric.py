@@ -88,10 +88,12 @@ def geometric_labels(points: Points) -> Labels:
     level = rotated(near, upright(near))
     heights = heights_above_ground(level, max_range_m=MAX_RANGE_M)
     of_level = np.where(heights < GROUND_HEIGHT_M, np.uint8(Label.ROAD), np.uint8(Label.VEGETATION))
-    for rule in (_poles, _solids, _walls):
+    for rule in (_poles, _solids):
         rest = np.flatnonzero(of_level == Label.VEGETATION)
         for kind, found in rule(level[rest], heights[rest]):
             of_level[rest[found]] = kind
+    rest = np.flatnonzero(of_level == Label.VEGETATION)
+    of_level[rest[on_walls(level[rest], heights[rest])]] = Label.BUILDING
     labels[usable] = of_level
     return labels
 
@@ -113,10 +115,6 @@ def _solids(points: Points, heights: Vector) -> Found:
     for kind, suitable, eligible in ((Label.TRUNK, is_trunk, in_band), (Label.CAR, is_car, heights < BAND_M[1])):
         in_chosen = np.append(_most_seen(found, suitable), False)[found.of_point]  # NO_PIECE is the last one
         yield kind, in_chosen & eligible
-
-
-def _walls(points: Points, heights: Vector) -> Found:
-    yield Label.BUILDING, on_walls(points, heights)
 
 
 def on_thin_uprights(points: Points, heights: Vector) -> Mask:

@@ -67,8 +67,11 @@ def heights_above_ground(points: Points, *, max_range_m: float) -> Vector:
     cells = np.clip(np.floor(points[:, :2] / GROUND_CELL_M).astype(np.int64) + half, 0, 2 * half - 1)
     cell = cells[:, 0] * 2 * half + cells[:, 1]
     starts = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=4 * half * half))])
-    z = points[np.argsort(cell, kind="stable"), 2]
-    surface = _follow(z, starts, _outward(half), _start_height(points), half)
+    x, y, z = points.T
+    # The ground at the sensor is the 10th percentile of the points below it within 8 m.
+    below = z[(x >= -8.0) & (x < 8.0) & (y >= -8.0) & (y < 8.0) & (z < -0.3)]
+    at_sensor = float(np.percentile(below, 10)) if len(below) else -1.7
+    surface = _follow(z[np.argsort(cell, kind="stable")], starts, _outward(half), at_sensor, half)
     return points[:, 2] - _interpolate(points, surface, half)
 
 
@@ -122,13 +125,6 @@ def _outward(half: int) -> Indices:
     """Cells of the grid by distance from the sensor, nearest first."""
     squared = (2 * np.arange(-half, half) + 1) ** 2
     return np.argsort((squared[:, None] + squared).ravel(), kind="stable")
-
-
-def _start_height(points: Points) -> float:
-    """Height of the ground at the sensor: 10th percentile of the points below it within 8 m; -1.7 m without points."""
-    x, y, z = points.T
-    below = z[(x >= -8.0) & (x < 8.0) & (y >= -8.0) & (y < 8.0) & (z < -0.3)]
-    return float(np.percentile(below, 10)) if len(below) else -1.7
 
 
 @kernel("float64[:, ::1](float64[::1], int64[::1], int64[::1], float64, int64)")

@@ -61,9 +61,15 @@ def parked_cars(
 def _cars_at(
     spot: Spot, across: bool, site: Site, route: Route, config: WorldConfig, rng: np.random.Generator
 ) -> Iterator[ParkedCar]:
-    """The successive cars at one place."""
+    """The cars at one place: one for the whole drive, or with a change between two visits."""
     turn = (np.pi / 2 if across else 0.0) + np.pi * rng.integers(2) + rng.normal(scale=0.03)
-    for start, end in _stays(route, spot, config, rng):
+    changes = rng.uniform() < config.parked_cars_gone
+    change = time_between_visits(route, spot.x, spot.y, rng) if changes else None
+    stays = [(-math.inf, math.inf)]
+    if change is not None:
+        left, came = (-math.inf, change), (change, math.inf)
+        stays = [[left], [came], [left, came]][int(rng.integers(3))]
+    for start, end in stays:
         lorry = not across and rng.uniform() < TRUCKS
         made = objects.truck(rng) if lorry else objects.car(rng)
         yield ParkedCar(site.stand(made, spot, turn_rad=float(turn)), (spot.x, spot.y), start, end)
@@ -96,16 +102,6 @@ def _court_spots(
             for along in np.arange(-width / 2 + 1.5, width / 2 - 1.4, COURT_SLOT_M):
                 if rng.uniform() < 0.5:
                     yield displaced(middle, along_m=float(along), out_m=rng.normal(scale=0.3)), True
-
-
-def _stays(route: Route, spot: Spot, config: WorldConfig, rng: np.random.Generator) -> list[tuple[float, float]]:
-    """Periods (s) in which a car stands at one place: the whole drive, or two with a change between two visits."""
-    changes = rng.uniform() < config.parked_cars_gone
-    change = time_between_visits(route, spot.x, spot.y, rng) if changes else None
-    if change is None:
-        return [(-math.inf, math.inf)]
-    left, came = (-math.inf, change), (change, math.inf)
-    return [[left], [came], [left, came]][int(rng.integers(3))]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -66,7 +66,7 @@ class SeenScan:
     @cached_property
     def surface(self) -> refinement.Surface:
         """The surface for a registration."""
-        return refinement.make_surface(self.thinned, config=self._config)
+        return refinement.Surface(self.thinned, self._config)
 
     @cached_property
     def free_space(self) -> FreeSpace:
@@ -148,7 +148,7 @@ class LocalMap:
             clouds = [self._in_map(thinned, T_odom_lidar) for T_odom_lidar, thinned in self._scans]
             if len(clouds) > 1:
                 clouds = [voxel_means(np.vstack(clouds), self.voxel_m, within_m=refinement.MAX_RANGE_M)]
-            self._surface = refinement.make_surface(clouds[0].astype(np.float32), config=self._config)
+            self._surface = refinement.Surface(clouds[0].astype(np.float32), self._config)
         return self._surface
 
     @property

@@ -43,5 +43,5 @@ def prepare_observed(
 ) -> Observed:
     """Surface and free space as in `prepare_scan`."""
     still = points.compress(labels < Label.MOVING_CAR, axis=0)
-    surface = refinement.make_surface(refinement.downsample(still, config=config.refine), config=config.refine)
+    surface = refinement.Surface(refinement.downsample(still, config=config.refine), config.refine)
     return Observed(surface, observe_free_space(still if seen_from_here is None else seen_from_here))

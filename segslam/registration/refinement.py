@@ -6,7 +6,6 @@ translation] with the perturbation on the right.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -63,15 +62,25 @@ UNOBSERVED = 0.01
 """Chosen: a ratio of variances below this means unobserved; a smooth tunnel has 0.001, from GICP's tangents."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """A scan prepared for GICP: downsampled points with covariances, and their search tree."""
+    """A scan prepared for GICP: downsampled points with covariances, and their search tree.
 
-    cloud: Any
-    tree: Any
-    roughness_m: float
-    """Root mean square distance of standing points to the plane through the nearest other point: the residual due to
-    noise and shape within one scan at this voxel size."""
+    It may be empty; `refine` then rejects. It is pickled as its points.
+    """
+
+    def __init__(self, downsampled: Points, config: RefineConfig) -> None:
+        self._config = config
+        self.cloud = small_gicp.PointCloud(downsampled.astype(np.float64))
+        self.tree = _tree_of(self.cloud)
+        self.roughness_m = LEAST_ROUGHNESS * config.voxel_m
+        """Root mean square distance of standing points to the plane through the nearest other point: the residual due
+        to noise and shape within one scan at this voxel size."""
+        if len(downsampled) >= MIN_POINTS:
+            small_gicp.estimate_normals_covariances(self.cloud, self.tree, NUM_NEIGHBOURS, 1)
+            self.roughness_m = max(self._roughness_m(), self.roughness_m)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Surface, (self.points.astype(np.float32), self._config)
 
     @property
     def points(self) -> Points:
@@ -86,7 +95,7 @@ class Surface:
     def standing(self) -> tuple[Points, Points]:
         """(k, 3) points on surfaces steeper than 45 degrees, and their unit normals; the scan's z points up."""
         normals = self.normals
-        stands = _stands(normals)
+        stands = np.abs(normals[:, 2]) < STANDING_NORMAL_Z
         return self.points[stands], normals[stands]
 
     def __len__(self) -> int:
@@ -106,6 +115,24 @@ class Surface:
         rows, to_point = self.nearest(points)
         to_plane = np.einsum("ij,ij->i", points - self.points[rows], self.normals[rows])
         return to_point, np.abs(to_plane)
+
+    def sparse(self) -> "Surface":
+        """A surface with fewer points, whose refinement is near that of all points in a quarter of the time.
+
+        It is the surface itself where too few points would remain.
+        """
+        sampled = small_gicp.voxelgrid_sampling(self.points, SPARSE_VOXELS * self._config.voxel_m, 1)
+        return Surface(sampled.points()[:, :3], self._config) if sampled.size() >= LEAST_SPARSE else self
+
+    def _roughness_m(self) -> float:
+        standing, _ = self.standing()
+        if not len(standing):
+            return 0.0
+        nearest, squared = (np.asarray(found) for found in self.tree.batch_knn_search(standing, 2, num_threads=1))
+        near = squared[:, 1] < (ROUGHNESS_REACH * self._config.voxel_m) ** 2
+        others = nearest[near, 1]
+        to_plane = np.einsum("ij,ij->i", standing[near] - self.points[others], self.normals[others])
+        return float(np.sqrt(np.mean(to_plane**2))) if len(others) else 0.0
 
 
 class LightSurface:
@@ -145,45 +172,9 @@ def downsample(points: Points, *, config: RefineConfig) -> Points:
     return voxel_means(points, config.voxel_m, beyond_m=0.0, within_m=MAX_RANGE_M).astype(np.float32)
 
 
-def make_surface(downsampled: Points, *, config: RefineConfig) -> Surface:
-    """The surface through downsampled points. It may be empty; `refine` then rejects."""
-    cloud = small_gicp.PointCloud(downsampled.astype(np.float64))
-    tree = _tree_of(cloud)
-    if len(downsampled) < MIN_POINTS:
-        return Surface(cloud, tree, LEAST_ROUGHNESS * config.voxel_m)
-    small_gicp.estimate_normals_covariances(cloud, tree, NUM_NEIGHBOURS, 1)
-    return Surface(cloud, tree, _roughness(cloud, tree, config.voxel_m))
-
-
-def sparse(surface: Surface, *, config: RefineConfig) -> Surface:
-    """A surface with fewer points, whose refinement is near that of all points in a quarter of the time.
-
-    It is the surface itself where too few points would remain.
-    """
-    points = small_gicp.voxelgrid_sampling(surface.points, SPARSE_VOXELS * config.voxel_m, 1).points()[:, :3]
-    return make_surface(points, config=config) if len(points) >= LEAST_SPARSE else surface
-
-
 def _tree_of(points: Any) -> Any:
     """The search tree of an array or cloud; None of no points: small_gicp warns, and a search ends the program."""
     return small_gicp.KdTree(points) if len(points) else None
-
-
-def _roughness(cloud: Any, tree: Any, voxel_m: float) -> float:
-    points, normals = cloud.points()[:, :3], cloud.normals()[:, :3]
-    rows = np.flatnonzero(_stands(normals))
-    if not len(rows):
-        return LEAST_ROUGHNESS * voxel_m
-    nearest, squared = (np.asarray(found) for found in tree.batch_knn_search(points[rows], 2, num_threads=1))
-    near = squared[:, 1] < (ROUGHNESS_REACH * voxel_m) ** 2
-    rows, others = rows[near], nearest[near, 1]
-    to_plane = np.einsum("ij,ij->i", points[rows] - points[others], normals[others])
-    return max(float(np.sqrt(np.mean(to_plane**2))) if len(rows) else 0.0, LEAST_ROUGHNESS * voxel_m)
-
-
-def _stands(normals: Points) -> np.ndarray:
-    """(n,) True on surfaces steeper than 45 degrees."""
-    return np.abs(normals[:, 2]) < STANDING_NORMAL_Z
 
 
 def refine(

@@ -10,7 +10,7 @@ from itertools import islice, tee
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from segslam.core import geometry
-from segslam.core.config import Config, RefineConfig
+from segslam.core.config import Config
 from segslam.core.threads import Stopwatch
 from segslam.core.types import Alignment, Registration, Rejected, RejectReason, Transform, probability_text
 from segslam.registration import refinement, segregator
@@ -77,9 +77,9 @@ def _floor_plan(scan: PreparedScan) -> segregator.FloorPlan:
 
 
 @lru_cache(NUM_FEW)
-def few_points(source: PreparedScan, config: RefineConfig) -> refinement.Surface:
+def few_points(source: PreparedScan) -> refinement.Surface:
     """Some points of a source, which lead to poses."""
-    return refinement.sparse(source.surface, config=config)
+    return source.surface.sparse()
 
 
 def forget_scans() -> None:
@@ -176,7 +176,7 @@ class Trial(NamedTuple):
         config = self.config.refine
         with self.watch("refine"):
             return refinement.refine(
-                few_points(self.source, config),
+                few_points(self.source),
                 self.target.surface,
                 T_start,
                 config=config,

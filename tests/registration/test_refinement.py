@@ -12,7 +12,6 @@ from segslam.registration.refinement import (
     LightSurface,
     Surface,
     downsample,
-    make_surface,
     observability,
     refine,
     weakest_level,
@@ -22,7 +21,7 @@ CONFIG = RefineConfig()
 
 
 def surface(points: np.ndarray) -> Surface:
-    return make_surface(downsample(points, config=CONFIG), config=CONFIG)
+    return Surface(downsample(points, config=CONFIG), CONFIG)
 
 
 def _error(T_a: np.ndarray, T_b: np.ndarray) -> tuple[float, float]:
@@ -150,7 +149,7 @@ def test_real_pairs_are_refined_to_the_reference(real_pairs) -> None:
 
 def test_a_light_surface_has_the_normals_of_a_surface() -> None:
     thinned = downsample(corner(np.random.default_rng(0)), config=CONFIG)
-    light, whole = LightSurface(thinned), make_surface(thinned, config=CONFIG)
+    light, whole = LightSurface(thinned), Surface(thinned, CONFIG)
     rows = np.array([5, 3, 200, 3])
     for asked in (rows, np.arange(len(thinned))):  # the second time some are known
         found = light.normals_at(asked)

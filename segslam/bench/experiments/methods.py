@@ -12,14 +12,14 @@ from segslam import verification as registration
 from segslam.bench.experiments import baselines
 from segslam.bench.experiments.baselines import Estimate
 from segslam.bench.experiments.method_settings import check_method, method_config
-from segslam.core.config import Config, RefineConfig
+from segslam.core.config import Config
 from segslam.core.extras import how_to_install
 from segslam.core.memory import give_back, status_mb
 from segslam.core.threads import Stopwatch
 from segslam.core.types import Alignment, Description, Labels, Points, Registration, Rejected, SegslamError
 from segslam.registration import refinement, segregator
-from segslam.registration.free_space import FreeSpace, observe_free_space
-from segslam.registration.prepared import PreparedScan
+from segslam.registration.free_space import observe_free_space
+from segslam.registration.prepared import Observed, PreparedScan
 
 CLEAR_REFS = Path("/proc/self/clear_refs")
 RESET_PEAK = "5"
@@ -53,20 +53,9 @@ class Method:
     """Module of the extra `bench`, if the package is optional or slow to import."""
 
 
-class SurfaceScan:
-    """Surface and free space of a scan, for refinement and verification. It is pickled as its points."""
-
-    def __init__(self, downsampled: Points, free_space: FreeSpace, config: RefineConfig) -> None:
-        self.surface = refinement.make_surface(downsampled, config=config)
-        self.free_space = free_space
-        self._config = config
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return SurfaceScan, (self.surface.points.astype("float32"), self.free_space, self._config)
-
-
-def _surface(points: Points, labels: Labels, config: Config) -> SurfaceScan:
-    return SurfaceScan(refinement.downsample(points, config=config.refine), observe_free_space(points), config.refine)
+def _surface(points: Points, _: Labels, config: Config) -> Observed:
+    downsampled = refinement.downsample(points, config=config.refine)
+    return Observed(refinement.Surface(downsampled, config.refine), observe_free_space(points))
 
 
 def _description(method: str) -> Callable[[Points, Labels, Config], Description]:

@@ -8,7 +8,7 @@ import pytest
 from segslam.bench.simulation.files import prepare_folder, uncorrected, write_drive
 from segslam.bench.simulation.sensor import drive_sweeps
 from segslam.bench.simulation.tracks import NOMINAL_CALIB, Drive, example_drive, in_lane, read_drive
-from segslam.bench.simulation.world import build_world
+from segslam.bench.simulation.world import World
 from segslam.bench.simulation.world_settings import SensorConfig, SimulationConfig, WorldConfig
 from segslam.core.trajectory import read_poses, write_kitti
 from segslam.core.types import Label, SegslamError
@@ -28,7 +28,7 @@ def drive() -> Drive:
 
 @pytest.fixture(scope="module")
 def sweeps(drive):
-    world = build_world(drive.T_world_lidar, drive.time_s, config=CONFIG.world, seed=0)
+    world = World(drive.T_world_lidar, drive.time_s, config=CONFIG.world, seed=0)
     return list(drive_sweeps(world, drive.T_world_lidar, drive.time_s, config=CONFIG.sensor, seed=0))
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from segslam.bench.simulation.sensor import NO_ERROR, PATTERNS, SweepError, make_sensor, sweep
-from segslam.bench.simulation.world import build_world
+from segslam.bench.simulation.sensor import NO_ERROR, PATTERNS, Sensor, SweepError, sweep
+from segslam.bench.simulation.world import World
 from segslam.bench.simulation.world_settings import SensorConfig, WorldConfig
 from segslam.core.types import GROUND_LABELS, Label
 
@@ -33,17 +33,17 @@ def straight_drive(num_scans: int = 30) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def bare_world():
-    return build_world(*straight_drive(), config=EMPTY, seed=0)
+    return World(*straight_drive(), config=EMPTY, seed=0)
 
 
 @pytest.fixture(scope="module")
 def street():
-    return build_world(*straight_drive(), config=WorldConfig(moving_cars=0), seed=0)
+    return World(*straight_drive(), config=WorldConfig(moving_cars=0), seed=0)
 
 
 def scan_of(world, config: SensorConfig, *, at: int = 15, seed: int = 0, error: SweepError = NO_ERROR):
     T_world_lidar = straight_drive()[0][at]
-    sensor = make_sensor(config, seed=seed)
+    sensor = Sensor(config, seed=seed)
     return sweep(world, sensor, T_world_lidar, rng=np.random.default_rng(seed), error=error)
 
 
@@ -56,7 +56,7 @@ def elevations_deg(points: np.ndarray) -> np.ndarray:
     [("hdl64", 64, 2.0, -24.8), ("os1-64", 64, 22.5, -22.5), ("vlp16", 16, 15.0, -15.0)],
 )
 def test_beam_directions_are_those_of_the_data_sheet(name, beams, top_deg, bottom_deg):
-    sensor = make_sensor(perfect(name=name), seed=0)
+    sensor = Sensor(perfect(name=name), seed=0)
     found = np.unique(np.round(elevations_deg(sensor.directions), 3))
     assert len(found) == beams
     np.testing.assert_allclose([found[-1], found[0]], [top_deg, bottom_deg], atol=1e-3)
@@ -95,7 +95,7 @@ def test_beam_errors_last_from_sweep_to_sweep_and_change_with_the_seed(bare_worl
     first, again = (np.linalg.norm(scan_of(bare_world, config, at=at).points, axis=1) - truth for at in (15, 15))
     np.testing.assert_array_equal(first, again)
     assert len(np.unique(np.round(first, 6))) <= 64
-    errors = [make_sensor(config, seed=seed).range_error_m for seed in (0, 1)]
+    errors = [Sensor(config, seed=seed).range_error_m for seed in (0, 1)]
     assert not np.array_equal(*errors)
 
 
@@ -105,7 +105,7 @@ def test_dropout_loses_the_given_share(street):
 
 
 def test_grazing_and_far_ground_is_lost_before_near_ground(bare_world):
-    sensor = make_sensor(perfect(), seed=0)
+    sensor = Sensor(perfect(), seed=0)
     ranges = np.linalg.norm(scan_of(bare_world, perfect()).points, axis=1)
     all_ranges = bare_world.cast(straight_drive()[0][15], sensor.directions).range_m
     near, far = ((all_ranges > low) & (all_ranges < high) for low, high in ((3, 20), (60, 79)))

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from helpers.drives import simulate_drive
 
-from segslam.bench.simulation.sensor import make_sensor, sweep
+from segslam.bench.simulation.sensor import Sensor, sweep
 from segslam.bench.simulation.tracks import example_drive, read_drive
-from segslam.bench.simulation.world import build_world
+from segslam.bench.simulation.world import World
 from segslam.bench.simulation.world_settings import SensorConfig, SimulationConfig, WorldConfig
 from segslam.core.types import GROUND_LABELS, Label
 
@@ -22,7 +22,7 @@ def loop():
 
 @pytest.fixture(scope="module")
 def world(loop):
-    return build_world(*loop, config=STILL, seed=1)
+    return World(*loop, config=STILL, seed=1)
 
 
 def directions(num: int = 2000, *, seed: int = 0) -> np.ndarray:
@@ -68,7 +68,7 @@ def test_surfaces_but_the_ground_keep_away_from_the_path(world):
 
 
 def test_the_same_seed_makes_the_same_world_and_another_seed_another(world, loop):
-    again, other = (build_world(*loop, config=STILL, seed=seed) for seed in (1, 2))
+    again, other = (World(*loop, config=STILL, seed=seed) for seed in (1, 2))
     np.testing.assert_array_equal(world.static.vertices, again.static.vertices)
     assert world.static.vertices.shape != other.static.vertices.shape
 
@@ -99,7 +99,7 @@ def test_a_pose_off_the_drive_sees_the_same_world(world, loop):
     T_world_left[:3, 3] += 2.0 * T_world_here[:3, 1]
     seen = []
     for T_world_lidar in (T_world_here, T_world_left):
-        sensor = make_sensor(SensorConfig(), seed=0)
+        sensor = Sensor(SensorConfig(), seed=0)
         one = sweep(world, sensor, T_world_lidar, rng=np.random.default_rng(0))
         near = np.linalg.norm(one.points, axis=1) < 25.0
         seen.append(set(one.instances[near & (one.labels == Label.CAR)]))
@@ -110,7 +110,7 @@ def test_density_knobs_empty_the_street(loop):
     bare = WorldConfig(
         cars=0, trees=0, lamps=0, signs=0, clutter=0, built=0, courts=0, hedged=0, fenced=0, shrubs=0, moving_cars=0
     )
-    labels = np.unique(build_world(*loop, config=bare, seed=1).static.labels)
+    labels = np.unique(World(*loop, config=bare, seed=1).static.labels)
     np.testing.assert_array_equal(labels, [Label.TERRAIN])
 
 
@@ -119,7 +119,7 @@ def test_density_knobs_empty_the_street(loop):
     [("cars", Label.CAR), ("trees", Label.TRUNK), ("lamps", Label.POLE), ("signs", Label.TRAFFIC_SIGN)],
 )
 def test_each_knob_governs_its_own_class(loop, world, knob, label):
-    others = build_world(*loop, config=STILL.model_copy(update={knob: 0.0, "courts": 0.0, "shrubs": 0.0}), seed=1)
+    others = World(*loop, config=STILL.model_copy(update={knob: 0.0, "courts": 0.0, "shrubs": 0.0}), seed=1)
     before, after = ((one.static.labels == label).sum() for one in (world, others))
     assert after < 0.5 * before  # signs stand on poles
 
@@ -128,7 +128,7 @@ def test_rows_of_equal_trees_are_equally_spaced_and_identical():
     poses = np.tile(np.eye(4), (200, 1, 1))
     poses[:, 0, 3] = np.arange(200)
     config = STILL.model_copy(update={"equal_tree_rows": True, "shrubs": 0.0, "cars": 0.0, "built": 0.0, "trees": 10.0})
-    static = build_world(poses, 0.1 * np.arange(200), config=config, seed=0).static
+    static = World(poses, 0.1 * np.arange(200), config=config, seed=0).static
     trunks = [
         static.vertices[np.unique(static.triangles[(static.labels == Label.TRUNK) & (static.instances == one)])]
         for one in np.unique(static.instances[static.labels == Label.TRUNK])
@@ -144,8 +144,8 @@ def test_rows_of_equal_trees_are_equally_spaced_and_identical():
 def test_parked_cars_are_gone_at_the_second_visit_if_configured(world, loop):
     """The shared street of the loop is driven at its start, in its middle and at its end."""
     poses, time_s = loop
-    changing = build_world(poses, time_s, config=STILL.model_copy(update={"parked_cars_gone": 1.0}), seed=1)
-    rays = make_sensor(SensorConfig(), seed=0).directions
+    changing = World(poses, time_s, config=STILL.model_copy(update={"parked_cars_gone": 1.0}), seed=1)
+    rays = Sensor(SensorConfig(), seed=0).directions
     first, last = (changing.cast(poses[12], rays, time_s=when) for when in (time_s[12], time_s[-1]))
     car = (first.labels == Label.CAR) | (last.labels == Label.CAR)
     changed = first.range_m != last.range_m
@@ -156,7 +156,7 @@ def test_parked_cars_are_gone_at_the_second_visit_if_configured(world, loop):
 
 def test_moving_cars_move_and_keep_out_of_the_sensor(loop):
     poses, time_s = loop
-    world = build_world(poses, time_s, config=WorldConfig(moving_cars=8.0), seed=1)
+    world = World(poses, time_s, config=WorldConfig(moving_cars=8.0), seed=1)
     rays = directions(4000)
     seen = [world.cast(T, rays, time_s=now) for T, now in zip(poses[::15], time_s[::15], strict=True)]
     moving = [one.labels == Label.MOVING_CAR for one in seen]
@@ -178,7 +178,7 @@ def test_simulate_drive_numbers_and_stamps_its_scans(loop):
 
 
 def test_the_street_of_a_single_pose_extends_both_ways():
-    world = build_world(np.eye(4)[None], np.zeros(1), config=STILL, seed=0)
+    world = World(np.eye(4)[None], np.zeros(1), config=STILL, seed=0)
     hits = world.cast(np.eye(4), directions())
     assert (hits.labels == Label.ROAD).sum() > 400
     assert np.isfinite(hits.range_m).mean() > 0.8
@@ -201,14 +201,14 @@ def test_the_example_loop_drives_a_street_in_both_directions_and_again(loop):
 @pytest.mark.data
 def test_a_real_trajectory_rides_level_over_its_streets(data_dir):
     drive = read_drive(data_dir / "kitti" / "poses" / "06.txt", sequence="06")
-    world = build_world(drive.T_world_lidar, drive.time_s, config=STILL, seed=1)
+    world = World(drive.T_world_lidar, drive.time_s, config=STILL, seed=1)
     over = drive.T_world_lidar[:, 2, 3] - world.ground.height_at(*drive.T_world_lidar[:, :2, 3].T)
     np.testing.assert_allclose(over, 1.73, atol=0.05)
 
 
 def test_another_day_has_other_cars_in_the_same_streets(loop):
     days = [STILL.model_copy(update={"day": day}) for day in range(3)]
-    first, again, other = (build_world(*loop, config=config, seed=1) for config in days)
+    first, again, other = (World(*loop, config=config, seed=1) for config in days)
 
     def standing(world, *, cars: bool):
         rows = np.isin(world.static.labels, [Label.CAR, Label.TRUCK]) == cars

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from helpers.drives import NUM_SCANS, RADIUS_M, STEP_M, simulate_drive
 
-from segslam.bench.simulation.sensor import make_sensor, sweep, sweep_errors
-from segslam.bench.simulation.world import build_world
+from segslam.bench.simulation.sensor import Sensor, sweep, sweep_errors
+from segslam.bench.simulation.world import World
 from segslam.bench.simulation.world_settings import SensorConfig, SimulationConfig, WorldConfig
 from segslam.core import geometry
 from segslam.core.config import Config
@@ -34,8 +34,8 @@ def _pairs() -> list[tuple[Alignment, np.ndarray]]:
         [geometry.transform(geometry.yaw(a), [RADIUS_M * np.sin(a), -RADIUS_M * np.cos(a), 1.73]) for a in along]
     )
     time_s = 0.3 * np.arange(NUM_SCANS)
-    world = build_world(T_world_lidar, time_s, config=WorldConfig(), seed=4)
-    sensor = make_sensor(SensorConfig(), seed=4)
+    world = World(T_world_lidar, time_s, config=WorldConfig(), seed=4)
+    sensor = Sensor(SensorConfig(), seed=4)
     errors = list(sweep_errors(time_s, config=SensorConfig(), rng=np.random.default_rng(4)))
 
     def prepared(index: int) -> PreparedScan:

@@ -10,7 +10,7 @@ import numpy as np
 from segslam.bench.simulation.files import uncorrected
 from segslam.bench.simulation.sensor import Sweep, drive_sweeps
 from segslam.bench.simulation.tracks import example_drive
-from segslam.bench.simulation.world import build_world
+from segslam.bench.simulation.world import World
 from segslam.bench.simulation.world_settings import SensorConfig, SimulationConfig, WorldConfig
 from segslam.core import geometry
 from segslam.core.config import load_config
@@ -34,7 +34,7 @@ SEED = 3
 
 def simulate_drive(T_world_lidar: Poses, time_s: Vector, *, seed: int, config: SimulationConfig) -> Iterator[Scan]:
     """Labelled scans from level poses (n, 4, 4) at the times `time_s` (n,), ascending."""
-    world = build_world(T_world_lidar, time_s, config=config.world, seed=seed)
+    world = World(T_world_lidar, time_s, config=config.world, seed=seed)
     for index, one in enumerate(drive_sweeps(world, T_world_lidar, time_s, config=config.sensor, seed=seed)):
         yield Scan(one.points, round(time_s[index] * 1e9), index, one.labels)
 
@@ -51,7 +51,7 @@ def round_drive() -> tuple[tuple[Scan, ...], Trajectory]:
 def round_sweeps(*, seed: int = SEED, only: Collection[int] | None = None) -> Iterator[Sweep]:
     """The same with intensities; with another seed, through another town."""
     poses, time_s = _round()
-    world = build_world(poses, time_s, config=CONFIG.world, seed=seed)
+    world = World(poses, time_s, config=CONFIG.world, seed=seed)
     return drive_sweeps(world, poses, time_s, config=CONFIG.sensor, seed=seed, only=only)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from segslam.bench.simulation.sensor import Sweep, drive_sweeps
 from segslam.bench.simulation.tracks import Drive
-from segslam.bench.simulation.world import build_world
+from segslam.bench.simulation.world import World
 from segslam.bench.simulation.world_settings import SimulationConfig
 from segslam.core import geometry
 from segslam.core.errors import reason
@@ -70,7 +70,7 @@ def write_drive(
     folder = out / "sequences" / sequence
     settings = {"seed": seed, "config": config.model_dump(mode="json")}
     write_whole(folder / SETTINGS_FILE, json.dumps(settings, indent=1) + "\n")
-    world = build_world(drive.T_world_lidar, drive.time_s, config=config.world, seed=seed)
+    world = World(drive.T_world_lidar, drive.time_s, config=config.world, seed=seed)
     driven = driven or drive
     write_whole(folder / "calib.txt", driven.calib)
     T_first_lidar = geometry.inverse(drive.T_world_lidar[0]) @ driven.T_world_lidar

@@ -101,20 +101,24 @@ SIGNAL = 35.0  # chosen: a road (reflectivity 0.2, normal incidence) is visible 
 GLASS_PASSES = 0.6  # chosen: share of the rays that a car window does not return
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Sensor:
-    """One sensor with fixed errors. Its n rays are ordered by beam, the top beam first."""
+    """One sensor with fixed errors, drawn with the seed. Its n rays are ordered by beam, the top beam first."""
 
-    pattern: Pattern
-    config: SensorConfig
-    directions: Points
-    """(n, 3) unit vectors of the true beam directions in the LiDAR frame."""
-    reported: Points
-    """(n, 3) reported beam directions."""
-    range_error_m: Vector
-    """(n,)"""
-    sweep_fraction: Vector
-    """(n,) time of each ray within the sweep: -0.5 at the start, behind the car, to 0.5 at the end."""
+    def __init__(self, config: SensorConfig, *, seed: int) -> None:
+        self.config = config
+        self.pattern = pattern = PATTERNS[config.name]
+        beams = len(pattern.elevations_deg)
+        rng = np.random.default_rng([seed, 2])
+        angle_error = config.vertical_angle_error_deg + rng.normal(scale=config.beam_angle_sigma_deg, size=beams)
+        range_error = rng.normal(scale=config.beam_range_sigma_m, size=beams)
+        azimuth = np.arange(pattern.num_azimuth) * (2 * np.pi / pattern.num_azimuth)
+        self.directions = _directions(pattern.elevations_deg + angle_error, azimuth)
+        """(n, 3) unit vectors of the true beam directions in the LiDAR frame."""
+        self.reported = _directions(pattern.elevations_deg, azimuth)
+        """(n, 3) reported beam directions."""
+        self.range_error_m = np.repeat(range_error, pattern.num_azimuth)
+        self.sweep_fraction = np.tile((azimuth / (2 * np.pi) + 0.5) % 1.0 - 0.5, beams)
+        """(n,) time of each ray within the sweep: -0.5 at the start, behind the car, to 0.5 at the end."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,24 +129,6 @@ class Sweep:
     intensity: Vector
     labels: Labels
     instances: Instances
-
-
-def make_sensor(config: SensorConfig, *, seed: int) -> Sensor:
-    """A sensor whose residual beam errors are drawn with the seed."""
-    pattern = PATTERNS[config.name]
-    beams = len(pattern.elevations_deg)
-    rng = np.random.default_rng([seed, 2])
-    angle_error = config.vertical_angle_error_deg + rng.normal(scale=config.beam_angle_sigma_deg, size=beams)
-    range_error = rng.normal(scale=config.beam_range_sigma_m, size=beams)
-    azimuth = np.arange(pattern.num_azimuth) * (2 * np.pi / pattern.num_azimuth)
-    return Sensor(
-        pattern,
-        config,
-        _directions(pattern.elevations_deg + angle_error, azimuth),
-        _directions(pattern.elevations_deg, azimuth),
-        np.repeat(range_error, pattern.num_azimuth),
-        np.tile((azimuth / (2 * np.pi) + 0.5) % 1.0 - 0.5, beams),
-    )
 
 
 def _directions(elevations_deg: Vector, azimuth_rad: Vector) -> Points:
@@ -200,7 +186,7 @@ def drive_sweeps(
 
     The sensor is the same on each simulated day; its noise differs.
     """
-    sensor = make_sensor(config, seed=seed)
+    sensor = Sensor(config, seed=seed)
     days = [world.day] if world.day else []
     errors = sweep_errors(time_s, config=config, rng=np.random.default_rng([seed, 3, *days]))
     for index, (T_world_now, now, error) in enumerate(zip(T_world_lidar, time_s, errors, strict=True)):

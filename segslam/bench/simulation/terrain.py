@@ -1,7 +1,5 @@
 """The ground along a drive: a smooth road through the driven path, kerbs, and terrain beyond."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
@@ -22,17 +20,26 @@ SCALES_M = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0)  # chosen: from the shape of the te
 Raster = Float[np.ndarray, "_ _"]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Terrain:
-    """Rasters with cells of CELL_M over x (rows) and y (columns), starting at `origin`."""
+    """Ground along a path: rasters with cells of CELL_M over x (rows) and y (columns), starting at `origin`."""
 
-    origin: Float[np.ndarray, "2"]
-    path_m: Raster
-    """Distance to the nearest point of the driven path."""
-    street_m: Raster
-    """Distance to the centre line of the nearest street."""
-    height_m: Raster
-    labels: np.ndarray
+    def __init__(self, path: np.ndarray, rng: np.random.Generator) -> None:
+        """The road goes through `path` (n, 3), whose points are at most 1 m apart."""
+        self.origin = np.floor(path[:, :2].min(axis=0) - MARGIN_M)
+        span = np.ceil(path[:, :2].max(axis=0) + MARGIN_M) - self.origin
+        blocks = [int(blocks) for blocks in np.ceil(span / (CELL_M * COARSE))]
+        at = path[:, :2] - self.origin
+        self.path_m = _distance_m(at / CELL_M, (blocks[0] * COARSE + 1, blocks[1] * COARSE + 1))
+        """Distance to the nearest point of the driven path."""
+        self.street_m = _distance_m((middle_of_street(path) - self.origin) / CELL_M, self.path_m.shape)
+        """Distance to the centre line of the nearest street."""
+        coarse = _through(path[:, 2], at / (CELL_M * COARSE), (blocks[0] + 1, blocks[1] + 1))
+        coarse += _relief(rng, self.street_m[::COARSE, ::COARSE])
+        along = [np.linspace(0, size - 1, (size - 1) * COARSE + 1) for size in coarse.shape]
+        fine = map_coordinates(coarse, np.stack(np.meshgrid(*along, indexing="ij")), order=1)
+        self.height_m = fine + np.clip((self.street_m - ROAD_M) / CELL_M, 0.0, 1.0) * KERB_M
+        kinds = [self.street_m < ROAD_M, self.street_m < SIDEWALK_M]
+        self.labels = np.select(kinds, [Label.ROAD, Label.SIDEWALK], Label.TERRAIN).astype(np.uint8)
 
     def cells(self, x: Vector, y: Vector) -> np.ndarray:
         """(2, n) row and column of the nearest node, clipped to the raster."""
@@ -54,22 +61,6 @@ def middle_of_street(path: np.ndarray) -> np.ndarray:
     """(n, 2) centre line of the street beside a path (n, 2 or 3) with points at most 1 m apart."""
     tangent = geometry.unit_rows(np.gradient(path[:, :2], axis=0))
     return path[:, :2] + LANE_M * np.column_stack([-tangent[:, 1], tangent[:, 0]])
-
-
-def ground_of(path: np.ndarray, rng: np.random.Generator) -> Terrain:
-    """The ground with a road through `path` (n, 3); points of the road are at most 1 m apart."""
-    origin = np.floor(path[:, :2].min(axis=0) - MARGIN_M)
-    span = np.ceil(path[:, :2].max(axis=0) + MARGIN_M) - origin
-    blocks = [int(blocks) for blocks in np.ceil(span / (CELL_M * COARSE))]
-    path_m = _distance_m((path[:, :2] - origin) / CELL_M, (blocks[0] * COARSE + 1, blocks[1] * COARSE + 1))
-    street_m = _distance_m((middle_of_street(path) - origin) / CELL_M, path_m.shape)
-    coarse = _through(path[:, 2], (path[:, :2] - origin) / (CELL_M * COARSE), (blocks[0] + 1, blocks[1] + 1))
-    coarse += _relief(rng, street_m[::COARSE, ::COARSE])
-    kerb = np.clip((street_m - ROAD_M) / CELL_M, 0.0, 1.0) * KERB_M
-    labels = np.select([street_m < ROAD_M, street_m < SIDEWALK_M], [Label.ROAD, Label.SIDEWALK], Label.TERRAIN)
-    along = [np.linspace(0, size - 1, (size - 1) * COARSE + 1) for size in coarse.shape]
-    fine = map_coordinates(coarse, np.stack(np.meshgrid(*along, indexing="ij")), order=1)
-    return Terrain(origin, path_m, street_m, fine + kerb, labels.astype(np.uint8))
 
 
 def _distance_m(at: np.ndarray, shape: tuple[int, ...]) -> Raster:

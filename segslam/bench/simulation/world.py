@@ -5,11 +5,11 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import open3d as o3d
 
-from segslam.bench.simulation.cars import MovingCar, ParkedCar, meshes_at, moving_cars, parked_cars
+from segslam.bench.simulation.cars import meshes_at, moving_cars, parked_cars
 from segslam.bench.simulation.mesh import Flags, Instances, Mesh, as_instance, join_meshes
 from segslam.bench.simulation.site import Route, Site, frontages, street_of
 from segslam.bench.simulation.streets import furnish
-from segslam.bench.simulation.terrain import Terrain, ground_mesh, ground_of
+from segslam.bench.simulation.terrain import Terrain, ground_mesh
 from segslam.bench.simulation.world_settings import WorldConfig
 from segslam.core.trajectory import Poses
 from segslam.core.types import Label, Labels, Points, Transform, Vector
@@ -30,18 +30,34 @@ class Hits:
     glass: Flags
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """Streets along one drive, made by `build_world`. Equal arguments make equal worlds."""
+    """Streets along one drive, and its cars. Equal arguments make equal worlds."""
 
-    day: int
-    ground: Terrain
-    static: Mesh
-    scene: o3d.t.geometry.RaycastingScene
-    """That of `static`."""
-    route: Route
-    parked: list[ParkedCar]
-    moving: list[MovingCar]
+    def __init__(self, T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, seed: int) -> None:
+        """The poses are level (`level_revisits`), z up; `time_s` (n,) ascends.
+
+        Every pose is `config.sensor_height_m` above the road, and no static object stands on the path. On another
+        `config.day` the streets are the same, but parked and moving cars differ.
+        """
+        rng = np.random.default_rng([seed, 1])
+        at = T_world_lidar[:, :3, 3] - np.array([0.0, 0.0, config.sensor_height_m])
+        steps = np.linalg.norm(np.diff(at[:, :2], axis=0), axis=1)
+        self.day = config.day
+        self.route = Route(at, np.asarray(time_s, dtype=np.float64), np.concatenate([[0.0], np.cumsum(steps)]))
+        street = street_of(self.route, T_world_lidar)
+        self.ground = Terrain(street, rng)
+        site = Site(self.ground)
+        sides = frontages(street)
+        today = np.random.default_rng([seed, 1, config.day]) if config.day else None
+        parked = [car for side in sides for car in parked_cars(site, side, self.route, config, rng, today=today)]
+        meshes = _numbered([car.mesh for car in parked])
+        parked = [replace(car, mesh=one) for car, one in zip(parked, meshes, strict=True)]
+        things = [thing for side in sides for thing in furnish(site, side, config, rng)]
+        standing = [car.mesh for car in parked if not car.changes]
+        self.static = join_meshes([ground_mesh(self.ground), *standing, *_numbered(things)])
+        self.scene = scene_of(self.static)
+        self.parked = [car for car in parked if car.changes]
+        self.moving = moving_cars(self.route, config, today or rng)
 
     def cast(self, T_world_lidar: Transform, directions: Points, *, time_s: float = 0.0) -> Hits:
         """The first hits of rays from the sensor's origin; `directions` (n, 3) are unit vectors in the LiDAR frame."""
@@ -57,31 +73,6 @@ class World:
         for thing in meshes_at(self.moving, self.route, time_s=time_s, near_xy=at, view_m=VIEW_M):
             _put_nearer(hits, thing, rays)
         return hits
-
-
-def build_world(T_world_lidar: Poses, time_s: Vector, *, config: WorldConfig, seed: int) -> World:
-    """Streets along a drive with level poses (`level_revisits`), z up; `time_s` (n,) ascending.
-
-    Every pose is `config.sensor_height_m` above the road, and no static object stands on the path. On another
-    `config.day` the streets are the same, but parked and moving cars differ.
-    """
-    rng = np.random.default_rng([seed, 1])
-    at = T_world_lidar[:, :3, 3] - np.array([0.0, 0.0, config.sensor_height_m])
-    steps = np.linalg.norm(np.diff(at[:, :2], axis=0), axis=1)
-    route = Route(at, np.asarray(time_s, dtype=np.float64), np.concatenate([[0.0], np.cumsum(steps)]))
-    street = street_of(route, T_world_lidar)
-    ground = ground_of(street, rng)
-    site = Site(ground)
-    sides = frontages(street)
-    today = np.random.default_rng([seed, 1, config.day]) if config.day else None
-    parked = [car for side in sides for car in parked_cars(site, side, route, config, rng, today=today)]
-    parked = [replace(car, mesh=one) for car, one in zip(parked, _numbered([car.mesh for car in parked]), strict=True)]
-    things = [thing for side in sides for thing in furnish(site, side, config, rng)]
-    standing = [car.mesh for car in parked if not car.changes]
-    static = join_meshes([ground_mesh(ground), *standing, *_numbered(things)])
-    changing = [car for car in parked if car.changes]
-    moving = moving_cars(route, config, today or rng)
-    return World(config.day, ground, static, scene_of(static), route, changing, moving)
 
 
 def _numbered(things: list[Mesh]) -> list[Mesh]:

@@ -11,7 +11,7 @@ from segslam.bench.experiments.job import open_once
 from segslam.bench.experiments.pairs import MIN_GAP, ScanVariant, Trial, read_pairs
 from segslam.bench.simulation.sensor import drive_sweeps
 from segslam.bench.simulation.tracks import read_drive
-from segslam.bench.simulation.world import World, build_world
+from segslam.bench.simulation.world import World
 from segslam.bench.simulation.world_settings import SimulationConfig, WorldConfig
 from segslam.core import geometry
 from segslam.core.types import Labels, Points, Scan, Transform
@@ -81,7 +81,7 @@ class SimulatedPlace:
 
     @cached_property
     def _world(self) -> World:
-        return build_world(self.T_world_lidar, self._time_s, config=self._config.world, seed=self._seed)
+        return World(self.T_world_lidar, self._time_s, config=self._config.world, seed=self._seed)
 
     def _simulated(self, index: int) -> Labelled:
         drive, sensor = (self.T_world_lidar, self._time_s), self._config.sensor

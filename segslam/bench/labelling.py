@@ -23,7 +23,7 @@ from segslam.labels import geometric_labels
 from segslam.labels.encodings import Colors, Encoding, of_classes
 from segslam.labels.label_files import computed, write_labels
 from segslam.labels.network_settings import ImageSettings
-from segslam.labels.range_image import EMPTY, project
+from segslam.labels.range_image import EMPTY, Projection
 from segslam.output.folder import write_csv
 from segslam.output.map.from_above import png
 from segslam.scans import Dataset
@@ -134,7 +134,7 @@ def draw_labels(points: Points, labels: Labels, *, truth: Labels | None, image: 
     ranges.suptitle(title, parse_math=False)  # names of files may contain a dollar sign
     strips = ranges.subplots(len(panels), 1, squeeze=False)[:, 0]
     squares = above.subplots(1, len(panels), squeeze=False)[0]
-    nearest = project(points.astype(np.float64), settings=image).nearest
+    nearest = Projection(points.astype(np.float64), settings=image).nearest
     for (name, colors), strip, square in zip(panels.items(), strips, squares, strict=True):
         seen = np.where((nearest == EMPTY)[..., None], BACKGROUND, colors[nearest]).astype(np.uint8)
         strip.imshow(seen, aspect="auto", interpolation="nearest")

@@ -9,13 +9,12 @@ combined by bitwise operations. A pole is an object with free space all around, 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import label, maximum_filter
 
 from segslam.core.points import within_range
-from segslam.core.types import IndexPairs, Indices, Label, Labels, Mask, Points, Vector
+from segslam.core.types import IndexPairs, Label, Labels, Mask, Points, Vector
 from segslam.labels.ground_surface import heights_above_ground, rotated, upright
 
 Found = Iterator[tuple[Label, Mask]]
@@ -100,7 +99,7 @@ def geometric_labels(points: Points) -> Labels:
 
 def _poles(points: Points, heights: Vector) -> Found:
     thin = on_thin_uprights(points, heights)
-    found = pieces(points[thin], heights[thin], np.full(thin.sum(), True))
+    found = Pieces(points[thin], heights[thin], np.full(thin.sum(), True))
     thin[thin] = _most_seen(found, np.full(len(found.top_m), True))[found.of_point]
     yield Label.POLE, thin
 
@@ -108,7 +107,7 @@ def _poles(points: Points, heights: Vector) -> Found:
 def _solids(points: Points, heights: Vector) -> Found:
     """Segments of the sizes of trunks and cars."""
     in_band = _within(heights, BAND_M)
-    found = pieces(points, heights, in_band)
+    found = Pieces(points, heights, in_band)
     is_trunk = (found.top_m >= TRUNK_MIN_M) & (found.length_m <= TRUNK_MAX_M)
     is_car = _within(found.top_m, CAR_TOP_M) & _within(found.length_m, CAR_LENGTH_M)
     is_car &= (found.width_m <= CAR_MAX_WIDTH_M) & ~is_trunk
@@ -180,37 +179,30 @@ def on_walls(points: Points, heights: Vector) -> Mask:
     return walls[rows[voxel]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Pieces:
-    """Segments of connected cells. All fields but `of_point` have one row per segment, from its chosen points."""
+    """Segments of connected cells of the chosen points of a level cloud. All but `of_point` have a row per segment."""
 
-    of_point: Indices
-    """(n,) segment of each point, also of points that were not chosen; NO_PIECE if it has none."""
-    num_points: Indices
-    top_m: Vector
-    """Height of the highest point above the ground."""
-    length_m: Vector
-    """Longer side of the smallest-area bounding rectangle in the x-y plane."""
-    width_m: Vector
-
-
-def pieces(points: Points, heights: Vector, chosen: Mask) -> Pieces:
-    """The segments of the chosen points of a level cloud."""
-    cells, _, shape = grid_cells(points, CELL_M, border=1)
-    occupied = np.zeros(shape, bool)
-    occupied[cells[chosen, 0], cells[chosen, 1]] = True
-    grid, num_pieces = label(occupied, structure=np.ones((3, 3), bool))
-    of_point = grid[cells[:, 0], cells[:, 1]].astype(np.int64) + NO_PIECE  # labels start at 1; 0 is the background
-    rows = np.flatnonzero(chosen)
-    rows = rows[np.argsort(of_point[rows], kind="stable")]
-    starts = np.searchsorted(of_point[rows], np.arange(num_pieces))
-    num_points = np.diff(starts, append=len(rows))
-    x, y = points[rows, 0], points[rows, 1]
-    turned = ((c * x + s * y, c * y - s * x) for c, s in zip(COSINES, SINES, strict=True))
-    sides_m = np.array([[np.maximum.reduceat(u, starts) - np.minimum.reduceat(u, starts) for u in uv] for uv in turned])
-    tightest = sides_m.prod(axis=1).argmin(axis=0)
-    width_m, length_m = np.sort(sides_m[tightest, :, np.arange(num_pieces)], axis=1).T
-    return Pieces(of_point, num_points, np.maximum.reduceat(heights[rows], starts), length_m, width_m)
+    def __init__(self, points: Points, heights: Vector, chosen: Mask) -> None:
+        cells, _, shape = grid_cells(points, CELL_M, border=1)
+        occupied = np.zeros(shape, bool)
+        occupied[cells[chosen, 0], cells[chosen, 1]] = True
+        grid, num_pieces = label(occupied, structure=np.ones((3, 3), bool))
+        self.of_point = grid[cells[:, 0], cells[:, 1]].astype(np.int64) + NO_PIECE  # labels start at 1, 0: background
+        """(n,) segment of each point, also of points that were not chosen; NO_PIECE if it has none."""
+        rows = np.flatnonzero(chosen)
+        rows = rows[np.argsort(self.of_point[rows], kind="stable")]
+        starts = np.searchsorted(self.of_point[rows], np.arange(num_pieces))
+        self.num_points = np.diff(starts, append=len(rows))
+        x, y = points[rows, 0], points[rows, 1]
+        turned = ((c * x + s * y, c * y - s * x) for c, s in zip(COSINES, SINES, strict=True))
+        sides_m = np.array(
+            [[np.maximum.reduceat(u, starts) - np.minimum.reduceat(u, starts) for u in uv] for uv in turned]
+        )
+        tightest = sides_m.prod(axis=1).argmin(axis=0)
+        self.width_m, self.length_m = np.sort(sides_m[tightest, :, np.arange(num_pieces)], axis=1).T
+        """Sides of the smallest-area bounding rectangle in the x-y plane, of the chosen points."""
+        self.top_m = np.maximum.reduceat(heights[rows], starts)
+        """Height of the highest chosen point above the ground."""
 
 
 def grid_cells(points: Points, cell_m: float, *, border: int) -> tuple[IndexPairs, Vector, tuple[int, int]]:

@@ -67,7 +67,7 @@ def open_labels(source: str, *, beside: Path, scan_names: Sequence[str], encodin
 
     Relative folders start at `beside`, where `auto` looks for `labels/`; without such a folder, `auto` is `geometric`.
     Raises SegslamError for a folder that is missing or labels none of the scans, for files whose encoding is neither
-    given nor detectable, and for a network that `open_network` rejects.
+    given nor detectable, and for a network that `Network` rejects.
     """
     if not isinstance(source, str):
         raise SegslamError(f"labels {source!r}: give a text: auto, none, geometric, network:MODEL.onnx or a folder")
@@ -77,9 +77,9 @@ def open_labels(source: str, *, beside: Path, scan_names: Sequence[str], encodin
     if source in ("none", "geometric"):
         return LabelSource(source == "geometric")
     if not has_files:
-        from segslam.labels.network import open_network
+        from segslam.labels.network import Network
 
-        return LabelSource(False, network=open_network(expanded(source.removeprefix(NETWORK))))
+        return LabelSource(False, network=Network(expanded(source.removeprefix(NETWORK))))
     folder = beside / ("labels" if source == "auto" else expanded(source))
     if source != "auto" and not folder.is_dir():
         raise SegslamError(f"--labels {source}: no folder {folder}; give one, auto, none, geometric or network:MODEL")

@@ -14,21 +14,45 @@ from segslam.core.errors import brief
 from segslam.core.extras import how_to_install
 from segslam.core.points import within_range
 from segslam.core.types import Label, Labels, Points, SegslamError, Vector
-from segslam.labels.network_settings import NetworkSettings, read_settings, settings_file
-from segslam.labels.range_image import network_input, point_labels, project
+from segslam.labels.network_settings import read_settings, settings_file
+from segslam.labels.range_image import Projection, network_input, point_labels
 
 LabelImage = UInt8[np.ndarray, "_ _"]
 
 
 class Network:
-    """A network that labels scans. Its input and output shapes were checked with an empty image when it was opened."""
+    """A network of an .onnx file that labels scans, with the settings of its `settings_file`."""
 
-    def __init__(self, model: Path, settings: NetworkSettings, session: Any) -> None:
-        self.settings = settings
+    def __init__(self, model: Path) -> None:
+        """Open the network, and check it on an empty image.
+
+        Raises SegslamError if a file is missing or invalid, if onnxruntime is not installed, and if model and settings
+        contradict each other (with both values).
+        """
+        if not model.is_file():
+            raise SegslamError(f"{model}: no such file; give the model as network:MODEL.onnx")
+        self.settings = read_settings(settings_file(model))
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise SegslamError(f"--labels network: needs a package ({error}): {how_to_install('network')}") from error
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 3  # errors, which are raised anyway
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads leave cores to others
+        try:
+            session = onnxruntime.InferenceSession(model, options, providers=onnxruntime.get_available_providers())
+            [(each.name, each.type, each.shape) for each in session.get_inputs()]  # fails for names not in UTF-8
+        except _runtime_errors() as error:
+            raise SegslamError(
+                f"{model}: onnxruntime cannot load it ({brief(str(error), 300)}); {_remedy(error)}"
+            ) from error
+        wanted = (1, len(self.settings.channels), self.settings.height, self.settings.width)
+        _check_input(session, model, wanted)
         self._model = model
         self._session = session
         self._input = session.get_inputs()[0].name
-        self._label_of_class = np.array([int(label) for label in settings.classes], np.uint8)
+        self._label_of_class = np.array([int(label) for label in self.settings.classes], np.uint8)
+        self.label_image(np.zeros(wanted, np.float32))
 
     def labels(self, points: Points, intensities: Vector) -> Labels:
         """The label (n,) of each point (n, 3) of a scan in the LiDAR frame, in the order of its file.
@@ -40,7 +64,7 @@ class Network:
         usable = within_range(points, 0.0, np.inf)
         if usable.any():
             near = points[usable].astype(np.float64)
-            projection = project(near, settings=self.settings)
+            projection = Projection(near, settings=self.settings)
             image = network_input(near, intensities[usable], projection, settings=self.settings)
             labels[usable] = point_labels(self.label_image(image), projection, settings=self.settings.votes)
         return labels
@@ -76,36 +100,6 @@ class Network:
             wrong = ids.min() if ids.min() < 0 else ids.max()
             raise _misfit(self._model, f"gave class id {wrong}", f"names {num} classes, ids 0 to {num - 1}")
         return ids
-
-
-def open_network(model: Path) -> Network:
-    """The network of an .onnx file with its `settings_file`, checked on an empty image.
-
-    Raises SegslamError if a file is missing or invalid, if onnxruntime is not installed, and if model and settings
-    contradict each other (with both values).
-    """
-    if not model.is_file():
-        raise SegslamError(f"{model}: no such file; give the model as network:MODEL.onnx")
-    settings = read_settings(settings_file(model))
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise SegslamError(f"--labels network: needs a package ({error}): {how_to_install('network')}") from error
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3  # errors, which are raised anyway
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads leave the cores to others
-    try:
-        session = onnxruntime.InferenceSession(model, options, providers=onnxruntime.get_available_providers())
-        [(each.name, each.type, each.shape) for each in session.get_inputs()]  # fails for names that are not UTF-8
-    except _runtime_errors() as error:
-        raise SegslamError(
-            f"{model}: onnxruntime cannot load it ({brief(str(error), 300)}); {_remedy(error)}"
-        ) from error
-    wanted = (1, len(settings.channels), settings.height, settings.width)
-    _check_input(session, model, wanted)
-    network = Network(model, settings, session)
-    network.label_image(np.zeros(wanted, np.float32))
-    return network
 
 
 def _runtime_errors() -> tuple[type[Exception], ...]:

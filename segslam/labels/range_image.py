@@ -7,50 +7,41 @@ Differs from the paper: the image wraps around at its last column.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from segslam.core import geometry
 from segslam.core.kernels import kernel
-from segslam.core.types import Indices, Label, Labels, Points, Vector
+from segslam.core.types import Label, Labels, Points, Vector
 from segslam.labels.network_settings import ImageSettings, NetworkSettings, VoteSettings
 
 EMPTY = -1
 """Value of a pixel without a point."""
 
 
-class Projection(NamedTuple):
-    """The pixel of each point of a scan. `rows`, `columns` and `ranges_m` have one entry per point."""
-
-    rows: Indices
-    columns: Indices
-    ranges_m: Vector
-    nearest: Int[np.ndarray, "_ _"]
-    """(height, width) index of the nearest point in each pixel, or EMPTY."""
-
-    def image_ranges_m(self) -> Float[np.ndarray, "_ _"]:
-        """(height, width) range of each pixel, infinite for empty pixels."""
-        return np.append(self.ranges_m, np.inf)[self.nearest]
-
-
-def project(points: Points, *, settings: ImageSettings) -> Projection:
+class Projection:
     """The pixels of points (n, 3) of the LiDAR frame. Points must be finite and not at the origin.
 
     The first column is behind the sensor; columns go clockwise as seen from above. Points above or below the field of
     view are assigned to the first or last row.
     """
-    ranges_m, elevations, azimuths = geometry.spherical(points)
-    low, high = np.radians(settings.field_of_view_deg)
-    turns = 0.5 - azimuths / math.tau
-    rows = np.clip(np.floor((high - elevations) / (high - low) * settings.height), 0, settings.height - 1)
-    columns = np.clip(np.floor(turns * settings.width), 0, settings.width - 1)
-    rows, columns = rows.astype(np.int64), columns.astype(np.int64)
-    nearest = np.full((settings.height, settings.width), EMPTY, np.int64)
-    far_first = np.argsort(-ranges_m, kind="stable")
-    nearest[rows[far_first], columns[far_first]] = far_first  # the last assignment to a pixel remains
-    return Projection(rows, columns, ranges_m, nearest)
+
+    def __init__(self, points: Points, *, settings: ImageSettings) -> None:
+        self.ranges_m, elevations, azimuths = geometry.spherical(points)
+        low, high = np.radians(settings.field_of_view_deg)
+        turns = 0.5 - azimuths / math.tau
+        rows = np.clip(np.floor((high - elevations) / (high - low) * settings.height), 0, settings.height - 1)
+        columns = np.clip(np.floor(turns * settings.width), 0, settings.width - 1)
+        self.rows, self.columns = rows.astype(np.int64), columns.astype(np.int64)
+        self.nearest = np.full((settings.height, settings.width), EMPTY, np.int64)
+        """(height, width) index of the nearest point in each pixel, or EMPTY."""
+        far_first = np.argsort(-self.ranges_m, kind="stable")
+        self.nearest[self.rows[far_first], self.columns[far_first]] = far_first  # the last assignment remains
+
+    def image_ranges_m(self) -> Float[np.ndarray, "_ _"]:
+        """(height, width) range of each pixel, infinite for empty pixels."""
+        return np.append(self.ranges_m, np.inf)[self.nearest]
 
 
 def network_input(

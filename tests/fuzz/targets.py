@@ -21,7 +21,7 @@ from segslam.gnss.reading import read_fixes
 from segslam.graph.batch import Robust, optimize_graph
 from segslam.graph.g2o import read_g2o
 from segslam.labels.label_files import encoding_of, read_labels
-from segslam.labels.network import open_network
+from segslam.labels.network import Network
 from segslam.labels.network_settings import read_settings
 from segslam.output.log import read_log
 from segslam.scans import open_dataset
@@ -207,7 +207,7 @@ def _labels(file: Path) -> None:
 
 
 def _network(file: Path) -> None:
-    network = open_network(file)
+    network = Network(file)
     network.labels(np.random.default_rng(0).uniform(-20, 20, (50, 3)), np.ones(50))
 
 

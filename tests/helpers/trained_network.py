@@ -12,7 +12,7 @@ from segslam.bench.labelling import NUM_CLASSES, STILL
 from segslam.bench.simulation.files import uncorrected
 from segslam.bench.simulation.sensor import Sweep
 from segslam.labels.network_settings import NetworkSettings
-from segslam.labels.range_image import EMPTY, network_input, project
+from segslam.labels.range_image import EMPTY, Projection, network_input
 
 SETTINGS: dict[str, Any] = {
     "field_of_view_deg": [-22.8, 22.5],
@@ -44,7 +44,7 @@ def train_network(folder: Path, sweeps: Iterable[Sweep], *, pixels_per_scan: int
     rows, targets = [], []
     for one in sweeps:
         points = uncorrected(one.points)
-        projection = project(points, settings=settings)
+        projection = Projection(points, settings=settings)
         image = network_input(points, one.intensity, projection, settings=settings)[0]
         pixels = np.argwhere(projection.nearest != EMPTY)
         pixels = pixels[rng.choice(len(pixels), pixels_per_scan, replace=False)]

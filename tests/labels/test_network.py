@@ -18,7 +18,7 @@ from onnx import TensorProto, helper
 from segslam.core.config import OdometryConfig
 from segslam.core.types import Label, SegslamError
 from segslam.labels.label_files import computed, open_labels
-from segslam.labels.network import open_network
+from segslam.labels.network import Network
 from segslam.labels.network_settings import read_settings
 from segslam.odometry.sweep import deskew_scan
 from segslam.scans import open_dataset
@@ -30,13 +30,13 @@ DOCS = Path(__file__).resolve().parents[2] / "docs" / "network_labels.md"
 @pytest.mark.parametrize("ids", [False, True])
 def test_each_point_gets_the_class_that_the_network_gives_its_pixel(tmp_path: Path, ids: bool) -> None:
     points, intensities = one_point_a_pixel()
-    labels = open_network(made_network(tmp_path, ids=ids)).labels(points, intensities)
+    labels = Network(made_network(tmp_path, ids=ids)).labels(points, intensities)
     np.testing.assert_array_equal(labels, LABELS[expected_classes(points, intensities)])
     assert len(np.unique(labels)) == 3
 
 
 def test_labels_go_with_their_points_in_whatever_order(tmp_path: Path) -> None:
-    network = open_network(made_network(tmp_path, votes={"window": 5}))
+    network = Network(made_network(tmp_path, votes={"window": 5}))
     points, intensities = one_point_a_pixel()
     order = np.random.default_rng(2).permutation(len(points))
     np.testing.assert_array_equal(
@@ -46,17 +46,17 @@ def test_labels_go_with_their_points_in_whatever_order(tmp_path: Path) -> None:
 
 def test_points_that_are_no_return_stay_unlabelled(tmp_path: Path) -> None:
     points = np.array([[np.nan, 1, 1], [0, 0, 0], [np.inf, 0, 0], [9, 0, 0]])
-    labels = open_network(made_network(tmp_path)).labels(points, np.zeros(4))
+    labels = Network(made_network(tmp_path)).labels(points, np.zeros(4))
     assert (labels == Label.UNLABELLED).tolist() == [True, True, True, False]
-    assert open_network(made_network(tmp_path)).labels(points[:0], np.zeros(0)).shape == (0,)
+    assert Network(made_network(tmp_path)).labels(points[:0], np.zeros(0)).shape == (0,)
 
 
 def test_sizes_that_the_model_leaves_open_fit_any_settings(tmp_path: Path) -> None:
     points, intensities = one_point_a_pixel()
     fixed, free = tmp_path / "fixed", tmp_path / "free"
     fixed.mkdir(), free.mkdir()
-    labels = open_network(made_network(free, input_shape=("n", 5, "h", "w"))).labels(points, intensities)
-    np.testing.assert_array_equal(labels, open_network(made_network(fixed)).labels(points, intensities))
+    labels = Network(made_network(free, input_shape=("n", 5, "h", "w"))).labels(points, intensities)
+    np.testing.assert_array_equal(labels, Network(made_network(fixed)).labels(points, intensities))
 
 
 def _two_inputs(folder: Path) -> Path:
@@ -119,7 +119,7 @@ def test_mismatches_are_reported_when_a_network_is_opened(
     tmp_path: Path, make: Callable[[Path], Path], expected: str
 ) -> None:
     with pytest.raises(SegslamError, match=expected):
-        open_network(make(tmp_path))
+        Network(make(tmp_path))
 
 
 def test_ids_of_another_shape_are_refused_with_both_shapes(tmp_path: Path) -> None:
@@ -127,13 +127,13 @@ def test_ids_of_another_shape_are_refused_with_both_shapes(tmp_path: Path) -> No
     ids = helper.make_tensor_value_info("ids", TensorProto.INT64, None)
     graph = helper.make_graph([helper.make_node("ArgMax", ["image"], ["ids"], axis=3, keepdims=0)], "g", [image], [ids])
     with pytest.raises(SegslamError, match=r"class ids of 1 x 5 x 16, but net\.yaml requires 1 x 16 x 90 or"):
-        open_network(save_network(tmp_path, graph))
+        Network(save_network(tmp_path, graph))
 
 
 def test_missing_package_is_named_with_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(SegslamError, match="pip install 'onnxruntime<"):
-        open_network(made_network(tmp_path))
+        Network(made_network(tmp_path))
 
 
 def test_intensities_of_a_drive_reach_the_network(tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_late_labels_lose_the_rows_that_their_points_lose(tmp_path: Path) -> Non
     ranges_m = np.linalg.norm(np.nan_to_num(returns[:, :3].astype(np.float64)), axis=1)
     rows = np.flatnonzero((ranges_m > 10) & (ranges_m < 20))
     assert 100 < len(rows) == len(kept_points)
-    expected = open_network(network).labels(returns[:, :3], returns[:, 3])[rows]
+    expected = Network(network).labels(returns[:, :3], returns[:, 3])[rows]
     np.testing.assert_array_equal(computed(labels), expected)
     assert len(np.unique(expected)) == 3
 

@@ -21,7 +21,7 @@ from segslam.core.trajectory import write_kitti
 from segslam.core.types import LoopClosure
 from segslam.labels.encodings import to_labels
 from segslam.labels.label_files import read_ids
-from segslam.labels.network import Network, open_network
+from segslam.labels.network import Network
 from segslam.output.log import read_log
 
 pytestmark = pytest.mark.usefixtures("short_runs")
@@ -141,7 +141,7 @@ def test_a_network_trained_in_other_towns_closes_loops_as_true_labels_do(true_ru
     lessons = [*round_sweeps(seed=7, only={0, 10, 20, 30, 40}), *round_sweeps(seed=8, only={5, 15, 25})]
     model = train_network(tmp_path, lessons)
     first = next(round_sweeps(only={33}))
-    counts = confusion(open_network(model).labels(uncorrected(first.points), first.intensity), first.labels)
+    counts = confusion(Network(model).labels(uncorrected(first.points), first.intensity), first.labels)
     assert 0.75 < np.trace(counts) / counts.sum() < 0.95
     _assert_as_good(_mapped(root, tmp_path / "run", f"network:{model}"), true_run)
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from helpers.made_networks import HEIGHT, SETTINGS, WIDTH, one_point_a_pixel
 
-from segslam.labels.network import open_network
+from segslam.labels.network import Network
 from segslam.labels.network_settings import NetworkSettings
-from segslam.labels.range_image import network_input, project
+from segslam.labels.range_image import Projection, network_input
 
 pytest.importorskip("onnxscript")
 torch = pytest.importorskip("torch")
@@ -86,7 +86,7 @@ def test_an_exported_network_labels_as_in_torch(tmp_path: Path, page: dict[str, 
     page["export"](model, tmp_path / "net.onnx", **SIZE)
     assert [file.name for file in tmp_path.glob("net*")] == ["net.onnx"]
     _write_settings(tmp_path, 4)
-    network = open_network(tmp_path / "net.onnx")
+    network = Network(tmp_path / "net.onnx")
     image = np.random.default_rng(0).normal(size=(1, 5, *SIZE.values())).astype(np.float32)
     with torch.no_grad():
         expected = trained.eval()(torch.from_numpy(image))[0][0].argmax(dim=0)
@@ -96,7 +96,7 @@ def test_an_exported_network_labels_as_in_torch(tmp_path: Path, page: dict[str, 
 def test_grouped_points_are_those_that_a_plain_loop_makes(page: dict[str, Any]) -> None:
     settings = NetworkSettings.model_validate(SETTINGS | SIZE)
     points, intensities = (rows[::2] for rows in one_point_a_pixel())
-    projection = project(points, settings=settings)
+    projection = Projection(points, settings=settings)
     image = network_input(points, intensities, projection, settings=settings)
     taken: list[Any] = []
     wrapper = page["GroupedPoints"](taken.extend, list(settings.mean), list(settings.std))
@@ -125,10 +125,10 @@ def test_a_network_of_grouped_points_is_exported_with_one_input(tmp_path: Path, 
     page["export"](model, tmp_path / "net.onnx", **SIZE)
     _write_settings(tmp_path, 4)
     points, intensities = one_point_a_pixel()
-    projection = project(points, settings=settings)
+    projection = Projection(points, settings=settings)
     image = network_input(points, intensities, projection, settings=settings)
     with torch.no_grad():
         expected = model(torch.from_numpy(image))[0].argmax(dim=0).numpy()
-    labels = open_network(tmp_path / "net.onnx").label_image(image)
+    labels = Network(tmp_path / "net.onnx").label_image(image)
     assert (labels == expected).mean() > 0.999  # equal logits are rare
     assert len(np.unique(labels)) > 1

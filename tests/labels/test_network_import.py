@@ -11,7 +11,7 @@ from helpers.made_networks import made_network
 
 from segslam.core.types import Label, SegslamError
 from segslam.labels.encodings import RAW_OF_LABEL
-from segslam.labels.network import open_network
+from segslam.labels.network import Network
 from segslam.labels.network_settings import DATA, read_settings, settings_file
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "network_labels.md"
@@ -117,7 +117,7 @@ def test_a_network_opens_with_the_files_that_it_ships(tmp_path: Path) -> None:
     settings_file(model).unlink()
     names = {"labels": {0: "road", 1: "car", 2: "pole"}, "learning_map_inv": {0: 0, 1: 1, 2: 2}}
     _write(tmp_path, _architecture(img_prop={"width": 90, "height": 16}), names)
-    assert open_network(model).settings.classes == (Label.ROAD, Label.CAR, Label.POLE)
+    assert Network(model).settings.classes == (Label.ROAD, Label.CAR, Label.POLE)
 
 
 def _without_classes(folder: Path) -> Path:

@@ -6,7 +6,7 @@ import numpy as np
 from helpers.made_networks import HEIGHT, SETTINGS, WIDTH
 
 from segslam.labels.network_settings import NetworkSettings
-from segslam.labels.range_image import EMPTY, network_input, project
+from segslam.labels.range_image import EMPTY, Projection, network_input
 
 NETWORK = NetworkSettings.model_validate(SETTINGS)
 
@@ -17,7 +17,7 @@ def _scan(num_points: int) -> np.ndarray:
 
 
 def test_ahead_is_the_middle_behind_the_edge_and_right_of_ahead_right_of_the_middle() -> None:
-    ahead, left, right, behind = project(
+    ahead, left, right, behind = Projection(
         np.array([[9.0, -0.1, 0], [0, 9.0, 0], [0, -9.0, 0], [-9.0, 0.1, 0]]), settings=NETWORK
     ).columns
     assert (ahead, left, right, behind) == (WIDTH // 2, WIDTH // 4, 3 * WIDTH // 4, 0)
@@ -26,13 +26,13 @@ def test_ahead_is_the_middle_behind_the_edge_and_right_of_ahead_right_of_the_mid
 def test_rows_go_down_and_what_is_beyond_the_field_of_view_lands_on_the_border() -> None:
     elevations = np.radians([40.0, 19.9, 1.0, -1.0, -19.9, -40.0])
     points = 10 * np.column_stack([np.cos(elevations), np.zeros(6), np.sin(elevations)])
-    rows = project(points, settings=NETWORK).rows
+    rows = Projection(points, settings=NETWORK).rows
     np.testing.assert_array_equal(rows, [0, 0, HEIGHT // 2 - 1, HEIGHT // 2, HEIGHT - 1, HEIGHT - 1])
 
 
 def test_each_pixel_shows_the_nearest_of_its_points() -> None:
     points = _scan(4000)
-    projection = project(points, settings=NETWORK)
+    projection = Projection(points, settings=NETWORK)
     nearest: dict[tuple[int, int], int] = {}
     for index, (x, y, z) in enumerate(points):
         high = math.radians(20.0)
@@ -54,7 +54,7 @@ def test_channels_are_normalised_in_the_given_order_and_empty_pixels_are_zero() 
         SETTINGS
         | {"channels": ["intensity", "z", "y", "x", "range"], "mean": [0.5, 0, 0, 1, 5], "std": [1, 2, 1, 1, 1]}
     )
-    projection = project(points, settings=backwards)
+    projection = Projection(points, settings=backwards)
     image = network_input(points, intensities, projection, settings=backwards)[0]
     at = projection.rows[0], projection.columns[0]
     np.testing.assert_allclose(image[:, *at], [0.0, 2.0, 0.0, 2.0, 0.0], atol=1e-6)
@@ -65,7 +65,7 @@ def test_pixels_without_a_point_are_exactly_zero_in_every_channel_including_the_
     points = _scan(500)
     channels = {"channels": ["range", "x", "y", "z", "intensity", "mask"], "mean": [9, 8, 7, 6, 5, 0], "std": [1] * 6}
     settings = NetworkSettings.model_validate(SETTINGS | channels)
-    projection = project(points, settings=settings)
+    projection = Projection(points, settings=settings)
     image = network_input(points, np.zeros(500), projection, settings=settings)[0]
     is_empty = projection.nearest == EMPTY
     assert 0 < is_empty.sum() < is_empty.size
@@ -75,7 +75,7 @@ def test_pixels_without_a_point_are_exactly_zero_in_every_channel_including_the_
 
 
 def test_ranges_of_the_image_are_infinite_where_nothing_returned() -> None:
-    projection = project(np.array([[3.0, 0.0, 0.4]]), settings=NETWORK)
+    projection = Projection(np.array([[3.0, 0.0, 0.4]]), settings=NETWORK)
     ranges_m = projection.image_ranges_m()
     assert np.isfinite(ranges_m).sum() == 1
     assert ranges_m.min() == projection.ranges_m[0]

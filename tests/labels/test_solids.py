@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 
 from segslam.core.geometry import yaw
-from segslam.labels.geometric import CELL_M, NO_PIECE, pieces
+from segslam.labels.geometric import CELL_M, NO_PIECE, Pieces
 
 
 def _rectangle(length_m, width_m, *, turn_deg, centre=(0.0, 0.0)):
@@ -17,7 +17,7 @@ def _rectangle(length_m, width_m, *, turn_deg, centre=(0.0, 0.0)):
 
 
 def _all(points):
-    return pieces(points, points[:, 2], np.full(len(points), True))
+    return Pieces(points, points[:, 2], np.full(len(points), True))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -53,7 +53,7 @@ def test_boxes_a_metre_apart_are_two_pieces():
 def test_points_that_were_not_chosen_join_nothing_but_learn_where_they_stand():
     points = np.vstack([_rectangle(2, 1, turn_deg=0), [[1.0, 0.5, 0.2], [5.0, 5.0, 0.2]]])
     chosen = np.arange(len(points)) < len(points) - 2
-    found = pieces(points, points[:, 2], chosen)
+    found = Pieces(points, points[:, 2], chosen)
     assert found.num_points == [len(points) - 2]
     np.testing.assert_array_equal(found.of_point[-2:], [0, NO_PIECE])
     assert found.top_m == [1.0]

@@ -6,7 +6,7 @@ from helpers.made_networks import SETTINGS
 
 from segslam.core.types import Label
 from segslam.labels.network_settings import NetworkSettings, VoteSettings
-from segslam.labels.range_image import Projection, point_labels, project, window_weights
+from segslam.labels.range_image import Projection, point_labels, window_weights
 
 NETWORK = NetworkSettings.model_validate(SETTINGS)
 
@@ -43,7 +43,7 @@ def _twin(image: np.ndarray, projection: Projection, settings: VoteSettings) -> 
 )
 def test_votes_are_those_of_the_plain_twin(settings: VoteSettings) -> None:
     rng = np.random.default_rng(1)
-    projection = project(rng.uniform([-9, -9, -3], [9, 9, 3], (800, 3)), settings=NETWORK)
+    projection = Projection(rng.uniform([-9, -9, -3], [9, 9, 3], (800, 3)), settings=NETWORK)
     image = rng.integers(0, 5, projection.nearest.shape, dtype=np.uint8)
     found = point_labels(image, projection, settings=settings)
     np.testing.assert_array_equal(found, _twin(image, projection, settings))
@@ -55,7 +55,7 @@ def test_a_wall_behind_a_post_keeps_its_label_where_the_post_hides_it() -> None:
     heights = np.linspace(-0.1, 0.1, 9) * 20.0
     wall = np.array([[20 * np.cos(a), 20 * np.sin(a), z] for a in azimuths for z in heights])
     post = np.array([[5.0, 0.1, z / 4] for z in heights])
-    projection = project(np.concatenate([wall, post]), settings=NETWORK)
+    projection = Projection(np.concatenate([wall, post]), settings=NETWORK)
     image = np.where(projection.nearest >= len(wall), np.uint8(Label.POLE), np.uint8(Label.BUILDING))
     labels = point_labels(image, projection, settings=VoteSettings())
     hidden = projection.nearest[projection.rows[: len(wall)], projection.columns[: len(wall)]] >= len(wall)

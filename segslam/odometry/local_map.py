@@ -13,7 +13,7 @@ from segslam.core.types import Points, Registration, Transform
 from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.nudge import CHECK_VOXELS, NUM_POINTS, NUM_SEARCH, POLISH_VOXELS, SEARCH_VOXELS, nudge
 from segslam.registration import refinement
-from segslam.registration.free_space import FreeSpace, observe_free_space
+from segslam.registration.free_space import FreeSpace
 from segslam.registration.prepared import Observed
 
 MAP_SCANS = 40
@@ -71,7 +71,7 @@ class SeenScan:
     @cached_property
     def free_space(self) -> FreeSpace:
         """Where the sensor saw through."""
-        return observe_free_space(self.points)
+        return FreeSpace(self.points)
 
     @cached_property
     def observed(self) -> Observed:

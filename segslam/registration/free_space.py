@@ -6,10 +6,9 @@ street, 0.4 m in a corridor.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int8
+from jaxtyping import Int8
 from scipy.ndimage import minimum_filter
 
 from segslam.core import geometry
@@ -41,7 +40,6 @@ IN_FRONT, AT_RETURN, BEHIND, NO_RETURN = range(4)
 """A point in front of all returns around its direction violates free space; behind them it is hidden."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class FreeSpace:
     """Spherical image of a scan: for each direction with a return, the nearest return there or in the 8 cells around.
 
@@ -49,30 +47,23 @@ class FreeSpace:
     they are unknown, not free, because grazing rays on the ground are often lost.
     """
 
-    nearest_m: Float[np.ndarray, "rows columns"]
-    """float32, m."""
-    lowest_rad: float
-    """Lower edge of the first row."""
-    row_rad: float
-    """Height of a row."""
-    margin_m: float
-    """Distance before a return at which a point violates free space, besides the growth with its range."""
-
-
-def observe_free_space(points: Points) -> FreeSpace:
-    """The spherical image of a scan; `points` (n, 3) in the sensor's frame."""
-    rays = np.ascontiguousarray(points, np.float32)
-    range_m, elevation_rad, column = _spherical(rays.compress(within_range(rays, 0.0, np.inf), axis=0))
-    lowest_rad = float(elevation_rad.min()) if len(range_m) else 0.0
-    row_rad = _row_height(elevation_rad - lowest_rad, column)
-    row = ((elevation_rad - lowest_rad) / row_rad).astype(np.int64)
-    nearest = np.full((row.max(initial=0) + 1, NUM_COLUMNS), np.inf, np.float32)
-    np.minimum.at(nearest, (row, column), range_m)
-    seen = np.isfinite(nearest)
-    around = minimum_filter(nearest, 3, mode=("nearest", "wrap"))
-    path_m = float(np.median(nearest[seen])) if seen.any() else 0.0
-    margin_m = min(max(SHARE_OF_PATH * path_m, MIN_MARGIN_M), FREE_SPACE_MARGIN_M)
-    return FreeSpace(np.where(seen, around, np.float32(np.inf)), lowest_rad, row_rad, margin_m)
+    def __init__(self, points: Points) -> None:
+        """`points` (n, 3) are in the sensor's frame."""
+        rays = np.ascontiguousarray(points, np.float32)
+        range_m, elevation_rad, column = _spherical(rays.compress(within_range(rays, 0.0, np.inf), axis=0))
+        self.lowest_rad = float(elevation_rad.min()) if len(range_m) else 0.0
+        """Lower edge of the first row."""
+        self.row_rad = _row_height(elevation_rad - self.lowest_rad, column)
+        """Height of a row."""
+        row = ((elevation_rad - self.lowest_rad) / self.row_rad).astype(np.int64)
+        nearest = np.full((row.max(initial=0) + 1, NUM_COLUMNS), np.inf, np.float32)
+        np.minimum.at(nearest, (row, column), range_m)
+        seen = np.isfinite(nearest)
+        self.nearest_m = np.where(seen, minimum_filter(nearest, 3, mode=("nearest", "wrap")), np.float32(np.inf))
+        """(rows, columns), float32, m."""
+        path_m = float(np.median(nearest[seen])) if seen.any() else 0.0
+        self.margin_m = min(max(SHARE_OF_PATH * path_m, MIN_MARGIN_M), FREE_SPACE_MARGIN_M)
+        """Distance before a return at which a point violates free space, besides the growth with its range."""
 
 
 def _spherical(points: Points) -> tuple[Vector, Vector, Indices]:

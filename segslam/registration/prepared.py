@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from segslam.core.config import Config
 from segslam.core.types import Description, Label, Labels, Points
 from segslam.registration import refinement, segregator
-from segslam.registration.free_space import FreeSpace, observe_free_space
+from segslam.registration.free_space import FreeSpace
 
 Labeller = Callable[[Points], Labels]
 
@@ -44,4 +44,4 @@ def prepare_observed(
     """Surface and free space as in `prepare_scan`."""
     still = points.compress(labels < Label.MOVING_CAR, axis=0)
     surface = refinement.Surface(refinement.downsample(still, config=config.refine), config.refine)
-    return Observed(surface, observe_free_space(still if seen_from_here is None else seen_from_here))
+    return Observed(surface, FreeSpace(still if seen_from_here is None else seen_from_here))

@@ -11,7 +11,7 @@ from segslam.core.config import Config
 from segslam.core.threads import Stopwatch
 from segslam.core.types import Alignment, Label, Registration, Rejected, RejectReason, SegslamError
 from segslam.registration import refinement, segregator
-from segslam.registration.free_space import observe_free_space
+from segslam.registration.free_space import FreeSpace
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.scans import open_dataset
 from segslam.verification import patches, register, register_near, register_prepared, rivals, score
@@ -226,7 +226,7 @@ def test_the_view_of_gathered_points_is_that_of_the_scan_in_their_middle() -> No
     gathered = np.concatenate([scans[0].points, scans[3].points])
     labels = np.full(len(gathered), Label.BUILDING, dtype=np.uint8)
     prepared = prepare_scan(gathered, labels, config=CONFIG, seen_from_here=scans[0].points)
-    np.testing.assert_array_equal(prepared.free_space.nearest_m, observe_free_space(scans[0].points).nearest_m)
+    np.testing.assert_array_equal(prepared.free_space.nearest_m, FreeSpace(scans[0].points).nearest_m)
     assert len(prepared.surface) > len(prepare_scan(scans[0].points, scans[0].labels, config=CONFIG).surface)
 
 

@@ -18,7 +18,7 @@ from segslam.core.memory import give_back, status_mb
 from segslam.core.threads import Stopwatch
 from segslam.core.types import Alignment, Description, Labels, Points, Registration, Rejected, SegslamError
 from segslam.registration import refinement, segregator
-from segslam.registration.free_space import observe_free_space
+from segslam.registration.free_space import FreeSpace
 from segslam.registration.prepared import Observed, PreparedScan
 
 CLEAR_REFS = Path("/proc/self/clear_refs")
@@ -55,7 +55,7 @@ class Method:
 
 def _surface(points: Points, _: Labels, config: Config) -> Observed:
     downsampled = refinement.downsample(points, config=config.refine)
-    return Observed(refinement.Surface(downsampled, config.refine), observe_free_space(points))
+    return Observed(refinement.Surface(downsampled, config.refine), FreeSpace(points))
 
 
 def _description(method: str) -> Callable[[Points, Labels, Config], Description]:

@@ -6,7 +6,7 @@ from helpers.commands import run
 
 from segslam.core import geometry
 from segslam.graph.g2o import read_g2o
-from segslam.output.finished import read_corrections, read_metrics, read_run
+from segslam.output.finished import read_corrections, read_metrics, read_result, read_run
 from segslam.output.folder import ADJUSTED_GRAPH
 from segslam.output.log import read_log
 from segslam.run.sessions.recorded import known_of, read_session
@@ -54,15 +54,15 @@ def test_the_motion_within_sweeps_is_corrected_in_the_run_and_in_its_map(
     metrics = read_metrics(folder)
     assert (metrics["sweep_s"], metrics["sweep_sigma_s"]) == (-0.1, 0.002)
     keyframes = [(row, step.keyframe) for row, step in enumerate(read_log(folder).steps()) if step.keyframe is not None]
-    corrections = read_corrections(read_log(folder), len(keyframes))
-    odometry = read_run(folder).result.odometry
+    result = read_run(folder).result
+    corrections, odometry = read_corrections(read_log(folder), result), result.odometry
     row, keyframe = keyframes[3]
     seconds = 1e-9 * float(odometry.stamp_ns[row + 1] - odometry.stamp_ns[row - 1])
     before, after = odometry.T_world_lidar[[row - 1, row + 1]]
     velocity = geometry.log(geometry.inverse(before) @ after) / seconds
     expected = keyframe.points - 0.1 * swept(keyframe.points.astype(np.float64), velocity, 180.0)
     np.testing.assert_allclose(corrections[3](keyframe.points), expected, atol=1e-4)
-    plain = read_corrections(read_log(log), len(keyframes))
+    plain = read_corrections(read_log(log), read_result(read_log(log)))
     np.testing.assert_array_equal(plain[3](keyframe.points), keyframe.points)
     known = known_of([read_session(folder)] * 2)
     assert known.sweep == pytest.approx(Sweep(-0.1, 0.002 / 2**0.5, 180.0))

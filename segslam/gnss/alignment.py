@@ -118,7 +118,10 @@ def _start(matched: Matched, source: str) -> Transform:
 
 
 def refined(matched: Matched, start: Transform, arm_m: Vector) -> Placement:
-    """The placement near `start` by iteratively reweighted least squares on the largest chain of consistent fixes."""
+    """The placement near `start` by iteratively reweighted least squares on the largest chain of consistent fixes.
+
+    `arm_m` (3,): position of the antenna in the LiDAR frame.
+    """
     T_enu_map = start
     for _ in range(ROUNDS):
         residual, columns = linearised(matched, T_enu_map, arm_m)

@@ -34,7 +34,10 @@ class KittiSequence(Dataset):
     """The selected scans of one drive, one row per scan."""
 
     def __init__(self, source: DataSource) -> None:
-        """Raises SegslamError if the sequence, its scans, its calibration or its times are missing."""
+        """The sequence of a folder with `sequences/`, or the folder itself if it is a sequence.
+
+        Raises SegslamError if the sequence, its scans, its calibration or its times are missing.
+        """
         folder, poses_file = _find_sequence(source.data, source.sequence)
         velodyne = folder / "velodyne"
         files, numbers = _numbered_scans(velodyne)

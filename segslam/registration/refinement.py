@@ -89,8 +89,8 @@ class Surface:
 
     @property
     def normals(self) -> Points:
-        """(n, 3), of unit length."""
-        return self.cloud.normals()[:, :3]
+        """(n, 3), of unit length; zero of fewer than `MIN_POINTS` points, which small_gicp leaves unset."""
+        return self.cloud.normals()[:, :3] if len(self) >= MIN_POINTS else np.zeros((len(self), 3))
 
     def standing(self) -> tuple[Points, Points]:
         """(k, 3) points on surfaces steeper than 45 degrees, and their unit normals; the scan's z points up."""

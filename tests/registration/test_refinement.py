@@ -157,6 +157,13 @@ def test_a_light_surface_has_the_normals_of_a_surface() -> None:
     np.testing.assert_array_equal(light.nearest(thinned[rows] + 0.01)[0], rows)
 
 
+def test_a_few_points_have_no_normals() -> None:
+    points = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32)
+    freed = [np.full((50, 4), np.nan) for _ in range(200)]
+    del freed  # memory that small_gicp takes over as it is
+    np.testing.assert_array_equal(Surface(points, CONFIG).normals, np.zeros((50, 3)))
+
+
 def test_a_thinned_cloud_has_the_mean_point_of_each_voxel_in_range() -> None:
     points = np.random.default_rng(0).uniform(-80, 80, (20_000, 3)).astype(np.float32)
     near = points[np.linalg.norm(points, axis=1) < refinement.MAX_RANGE_M].astype(np.float64)

@@ -240,6 +240,17 @@ def test_two_processes_write_the_same_poses(recordings: list[Path], tmp_path: Pa
         assert first == second, name
 
 
+def test_settings_of_dask_are_those_of_the_program_again(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    import dask
+
+    key = "distributed.worker.daemon"
+    before = dask.config.get(key)
+    with workers.workers(tmp_path, number=2, scheduler=None):
+        assert dask.config.get(key) is False, "also for a worker that is started again"
+    assert dask.config.get(key) is before is not False
+
+
 class _Client:
     """Workers that answer with a version, and see the folder or not."""
 

@@ -63,7 +63,10 @@ class Mapped:
 
 
 def _made_with(folder: Path) -> str:
-    """The key that a whole folder was made with; empty if there is no folder. One without must not be replaced."""
+    """The key that a whole folder was made with; empty if there is no folder.
+
+    Raises SegslamError for a folder without a key: it is not of a fleet, and must not be replaced.
+    """
     if not folder.exists():
         return ""
     try:

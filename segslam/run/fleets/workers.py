@@ -94,20 +94,20 @@ def cluster(shared: Path, *, workers: int, scheduler: str | None) -> Iterator[An
             _check(client, shared, scheduler)
             yield client
         return
-    dask.config.set({"distributed.worker.daemon": False})
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is for this process, which ends all
-    try:
-        options = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.ERROR}
-        local = LocalCluster(n_workers=workers, **options)
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    with local, Client(local) as client:
-        _check(client, shared, scheduler)
+    with dask.config.set({"distributed.worker.daemon": False}):  # a worker that is started again reads it, too
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # Ctrl-C is for this process, which ends all
         try:
-            yield client
+            options = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.ERROR}
+            local = LocalCluster(n_workers=workers, **options)
         finally:
-            for one in logs:
-                one.setLevel(logging.CRITICAL)  # after Ctrl-C they report each worker that is ended amid a task
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        with local, Client(local) as client:
+            _check(client, shared, scheduler)
+            try:
+                yield client
+            finally:
+                for one in logs:
+                    one.setLevel(logging.CRITICAL)  # after Ctrl-C they report each worker that is ended amid a task
 
 
 @contextmanager

@@ -102,19 +102,37 @@ def test_a_small_angle_is_as_uncertain_as_a_large_one() -> None:
     assert small.correction_deg == 0.0
 
 
-def test_an_angle_that_few_pairs_hardly_show_is_not_significant(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What 17 pairs show within 20 m of a campus: less than two standard deviations, and nothing after 0.26 degrees."""
-    seen_deg = iter([(-0.113, 0.061), (-0.047, 0.042), (0.166, 0.038)])
+def measured_with(
+    monkeypatch: pytest.MonkeyPatch, *left: tuple[float, float], near_deg: float | None = None
+) -> VerticalAngle | None:
+    """The angle if pairs show these angles and errors, without a correction and with the ones that are tried."""
+    shown_deg = iter(left)
     one = np.ones(1)
     monkeypatch.setattr(
         vertical_angle,
         "shown",
-        lambda *_: Shown(*(one * value for value in next(seen_deg)), gain=one, num_pairs=17),
+        lambda *_: Shown(*(one * value for value in next(shown_deg)), gain=one, num_pairs=17),
     )
-    found = measured(np.arange(-30.0, 31.0, 2.0))
+    places_m = np.arange(-30.0, 31.0, 2.0)
+    drive = lambda i: points_at(float(places_m[i])), poses_at(places_m), places_m + 30.0
+    return measure_vertical_angle(*drive, config=CONFIG, near_deg=near_deg)
+
+
+def test_an_angle_that_few_pairs_hardly_show_is_not_significant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What 17 pairs show within 20 m of a campus: less than two standard deviations, and with corrections no line."""
+    found = measured_with(monkeypatch, (-0.113, 0.061), (-0.047, 0.042), (0.166, 0.038))
     assert found is not None
-    assert found.angle_deg == pytest.approx(-0.26, abs=0.01)
+    assert found.angle_deg == pytest.approx(-0.20, abs=0.01)
     assert not found.is_significant
+
+
+def test_two_corrections_near_each_other_do_not_enlarge_the_error_of_what_pairs_show(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Exact but for the last value, 0.004 degrees too low, at a correction of 0.172 degrees, near the one of 0.195."""
+    found = measured_with(monkeypatch, (0.0655, 0.002), (-0.0087, 0.002), (-0.004, 0.002), near_deg=0.195)
+    assert found is not None
+    assert found.angle_deg == pytest.approx(0.172, abs=0.004 / 0.38)
 
 
 @pytest.mark.long

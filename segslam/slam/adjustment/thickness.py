@@ -14,6 +14,7 @@ from segslam.core.probabilities import SIGNIFICANT
 from segslam.core.processes import in_parts
 from segslam.core.trajectory import Poses
 from segslam.core.types import IndexPairs, Points, Transform, Vector
+from segslam.slam.adjustment.alignment import MOST_PAIRS
 
 CELL_M = 1.0
 """Chosen: edge of the cells that hold a patch; walls and roads are flat over it."""
@@ -23,8 +24,6 @@ MIN_POINTS = 5
 """Chosen: points of each scan in a patch."""
 FLAT = 0.05
 """Chosen: a patch is flat if its standard deviation along the normal is below this share of the next larger one."""
-MOST_PAIRS = 100
-"""Chosen: number of pairs of scans, evenly among those given; 2 s."""
 MIN_PATCHES = 20
 """Chosen: the median of fewer is too uncertain."""
 

@@ -91,9 +91,10 @@ def measure_vertical_angle(
 ) -> VerticalAngle | None:
     """The vertical angle by pairs of submaps that are some metres apart; None if too few pairs determine it.
 
-    An angle within `BIAS_DEG` is as they show it. Of a larger one they hide a part: it is the correction that leaves
-    none, by the method of secants, from no correction and `near_deg`, by default twice the angle that they show. Its
-    error is that of the angle they show, enlarged as much: few pairs may lead far without a reason.
+    An angle within `BIAS_DEG` is as they show it. Of a larger one they hide a part, the same one at any correction: it
+    is the correction that leaves none, by a line through what they show without one and with two others at most, the
+    first `near_deg`, by default twice the angle that they show. Its error is that of the angle they show, enlarged as
+    much: few pairs may lead far without a reason.
     `motion_variance` (n,): as of `is_known`, by default of exact poses.
     """
     variance = np.zeros(len(travel_m)) if motion_variance is None else motion_variance
@@ -112,19 +113,22 @@ def measure_vertical_angle(
     found = left_of(0.0)
     if found is None:
         return None
-    left_deg = shown_deg = float(found.value[0])
-    shown_sigma_deg = float(found.sigma[0])
-    if abs(left_deg) < BIAS_DEG:
-        return VerticalAngle(left_deg, math.hypot(shown_sigma_deg, BIAS_DEG), found.num_pairs)
-    before_deg, correction_deg = 0.0, 2.0 * left_deg if near_deg is None else near_deg
+    shown_deg, shown_sigma_deg = float(found.value[0]), float(found.sigma[0])
+    if abs(shown_deg) < BIAS_DEG:
+        return VerticalAngle(shown_deg, math.hypot(shown_sigma_deg, BIAS_DEG), found.num_pairs)
+    corrections_deg, left_deg = [0.0], [shown_deg]
+    correction_deg = 2.0 * shown_deg if near_deg is None else near_deg
     for _ in range(2):
-        found, last_deg = left_of(correction_deg), left_deg
-        left_deg = math.nan if found is None else float(found.value[0])
-        share = (last_deg - left_deg) / (correction_deg - before_deg)
-        if found is None or not share > 0.0:
+        found = left_of(correction_deg)
+        if found is None:
             return None
-        before_deg, correction_deg = correction_deg, correction_deg + left_deg / share
-        if abs(left_deg) < float(found.sigma[0]):
+        corrections_deg.append(correction_deg)
+        left_deg.append(float(found.value[0]))
+        slope, without_deg = np.polyfit(corrections_deg, left_deg, 1)
+        if not slope < 0.0:
+            return None
+        correction_deg = float(-without_deg / slope)
+        if abs(left_deg[-1]) < float(found.sigma[0]):
             break
     sigma_deg = math.hypot(shown_sigma_deg * correction_deg / shown_deg, BIAS_DEG)
     return VerticalAngle(correction_deg, sigma_deg, found.num_pairs)

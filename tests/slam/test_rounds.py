@@ -3,7 +3,7 @@
 import os
 import threading
 from collections.abc import Iterable, Iterator
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -16,8 +16,9 @@ from segslam.core.types import Alignment, LoopClosure, Registration
 from segslam.graph import Edge, PoseGraph
 from segslam.graph.levenberg_marquardt import Unsolvable
 from segslam.slam.adjustment import rounds
+from segslam.slam.adjustment.known import Known
 from segslam.slam.adjustment.rounds import Adjusted, adjust
-from segslam.slam.adjustment.sweeps import Velocities
+from segslam.slam.adjustment.sweeps import Correction, Velocities
 from segslam.slam.adjustment.vertical_angle import VerticalAngle
 
 STEP_M = 2.0
@@ -147,6 +148,28 @@ def test_a_second_round_is_announced_only_if_an_angle_is_corrected(
     made = graph()
     adjust(made, made.finish(), lambda _: np.empty((0, 3), np.float32), STILL, config=CONFIG, progress=shown)
     assert titles == [title]
+
+
+@pytest.mark.long
+def test_the_angle_of_several_drives_is_that_of_their_own_adjustments(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second round does not measure it either."""
+
+    def refuse(*_: object, **__: object) -> None:
+        pytest.fail("measured again")
+
+    monkeypatch.setattr(rounds, "measure_vertical_angle", refuse)
+    made, titles = graph(), list[str]()
+    known = Known(T_TRUE, [Correction(0.2)] * NUM, VerticalAngle(0.2, 0.01, 40))
+    low = partial(points, low_deg=0.2)
+
+    def shown(items: Iterable[object], total: int, title: str) -> Iterator[object]:
+        titles.append(title)
+        yield from items
+
+    found = adjust(made, made.finish(), low, STILL, config=CONFIG, known=known, progress=shown)
+    assert found is not None
+    assert titles == ["refine 1/2", "refine 2/2"]
+    assert found.record.vertical_deg == 0.2
 
 
 def test_a_graph_that_cannot_be_solved_with_the_submaps_stays_as_it_is(

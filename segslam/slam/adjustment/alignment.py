@@ -44,8 +44,8 @@ Corrects = Callable[[int, Points], Float[np.ndarray, "m n 3"]]
 """By how much points (n, 3) of a keyframe move if each of m alternative corrections grows by one."""
 MIN_PAIRS = 8
 """Chosen: the scatter of fewer pairs is too uncertain."""
-MOST_PAIRS = 100
-"""Chosen: number of pairs of keyframes that are measured each time, for a correction or a thickness; in 2 s."""
+MOST_PAIRS = 60
+"""Chosen: number of pairs of keyframes that are measured each time, for a correction or a thickness; in 1 s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

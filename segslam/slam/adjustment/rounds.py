@@ -201,9 +201,9 @@ def _rounds(
     num_rounds = config.adjustment.rounds if angle is not None and angle.is_significant else 1
     for number in range(1, num_rounds + 1):
         T_world = graph.T_world_keyframes
-        if angle is not None and number > 1:
+        if angle is not None and number > 1 and not known:
             # the motions of the odometry turn with the angle: submaps built by them show too much of it
-            again = measured(T_world, config=refine, near_deg=angle.angle_deg)
+            again = measured(T_world, config=refine, near=angle)
             if again is None or not again.is_significant:
                 break
             angle = again

@@ -49,6 +49,8 @@ class VerticalAngle:
     angle_deg: float
     sigma_deg: float
     num_pairs: int
+    share: float = 1.0
+    """Part of an angle that the pairs show."""
 
     @property
     def is_significant(self) -> bool:
@@ -87,14 +89,13 @@ def measure_vertical_angle(
     *,
     config: RefineConfig,
     motion_variance: Vector | None = None,
-    near_deg: float | None = None,
+    near: VerticalAngle | None = None,
 ) -> VerticalAngle | None:
     """The vertical angle by pairs of submaps that are some metres apart; None if too few pairs determine it.
 
-    An angle within `BIAS_DEG` is as they show it. Of a larger one they hide a part, the same one at any correction: it
-    is the correction that leaves none, by a line through what they show without one and with two others at most, the
-    first `near_deg`, by default twice the angle that they show. Its error is that of the angle they show, enlarged as
-    much: few pairs may lead far without a reason.
+    An angle within `BIAS_DEG` is as they show it. Of a larger one they hide a part: it is the correction that leaves
+    none, by a line through what they show without one and with one of twice that. `near`: a measurement with poses that
+    were worse, whose correction and share are used.
     `motion_variance` (n,): as of `is_known`, by default of exact poses.
     """
     variance = np.zeros(len(travel_m)) if motion_variance is None else motion_variance
@@ -110,28 +111,22 @@ def measure_vertical_angle(
         surface_of = surfaces_of(raised, T_world, variance, config=config)
         return shown(pairs, surface_of, T_world, lambda _, points: np.radians(geometry.raising(points))[None])
 
-    found = left_of(0.0)
+    correction_deg = 0.0 if near is None else near.angle_deg
+    found = left_of(correction_deg)
     if found is None:
         return None
-    shown_deg, shown_sigma_deg = float(found.value[0]), float(found.sigma[0])
-    if abs(shown_deg) < BIAS_DEG:
-        return VerticalAngle(shown_deg, math.hypot(shown_sigma_deg, BIAS_DEG), found.num_pairs)
-    corrections_deg, left_deg = [0.0], [shown_deg]
-    correction_deg = 2.0 * shown_deg if near_deg is None else near_deg
-    for _ in range(2):
-        found = left_of(correction_deg)
-        if found is None:
+    left_deg, sigma_deg = float(found.value[0]), float(found.sigma[0])
+    if near is not None:
+        share = near.share
+    elif abs(left_deg) < BIAS_DEG:
+        share = 1.0
+    else:
+        raised = left_of(2.0 * left_deg)
+        share = math.nan if raised is None else (left_deg - float(raised.value[0])) / (2.0 * left_deg)
+        if not share > 0.0:
             return None
-        corrections_deg.append(correction_deg)
-        left_deg.append(float(found.value[0]))
-        slope, without_deg = np.polyfit(corrections_deg, left_deg, 1)
-        if not slope < 0.0:
-            return None
-        correction_deg = float(-without_deg / slope)
-        if abs(left_deg[-1]) < float(found.sigma[0]):
-            break
-    sigma_deg = math.hypot(shown_sigma_deg * correction_deg / shown_deg, BIAS_DEG)
-    return VerticalAngle(correction_deg, sigma_deg, found.num_pairs)
+    sigma_deg = math.hypot(sigma_deg / share, BIAS_DEG)
+    return VerticalAngle(correction_deg + left_deg / share, sigma_deg, found.num_pairs, share)
 
 
 class Calibrator:

@@ -68,8 +68,9 @@ def test_mutual_neighbours_come_most_similar_first_and_so_in_the_same_order_from
     assert np.all(np.diff(np.linalg.norm(source[forth[:, 0]] - target[forth[:, 1]], axis=1)) >= 0)
 
 
-def test_mutual_neighbours_of_nothing_are_none() -> None:
-    assert mutual_nearest(np.empty((0, 33)), np.ones((3, 33))).shape == (0, 2)
+@pytest.mark.parametrize(("source", "target"), [(0, 3), (3, 0), (0, 0)])
+def test_mutual_neighbours_of_nothing_are_none(source: int, target: int) -> None:
+    assert mutual_nearest(np.ones((source, 33)), np.ones((target, 33))).shape == (0, 2)
 
 
 def test_tuple_test_keeps_rigidly_moved_rows_and_drops_the_others() -> None:

@@ -20,7 +20,8 @@ JUMP = geometry.transform(geometry.yaw(np.radians(40.0)), [3.0, 0.0, 0.0])
 AT = 117
 """The motion after this keyframe jumps."""
 BEFORE = [(source, source - 80) for source in range(84, 117, 8)]
-ACROSS = [(source, source - 80) for source in (119, 123, 127, 131, 140, 149)]
+ACROSS = [(source, source - 80) for source in (119, 123, 127, 131, 140, 159)]
+"""The last one is of the last keyframe."""
 UNKNOWN = np.diag(geometry.tangent(rotation_rad=np.radians(60.0), translation_m=20.0) ** -2.0)
 
 

@@ -24,7 +24,7 @@ from segslam.keyframes import KeyframeSelector, downsample_keyframe
 from segslam.labels.label_files import unlabelled
 from segslam.odometry.kiss import KissOdometry
 from segslam.registration.refinement import downsample
-from segslam.slam.adjustment.alignment import MIN_PAIRS, MOST_PAIRS, PointsOf, Shown, shown
+from segslam.slam.adjustment.alignment import MIN_PAIRS, MOST_PAIRS, SEARCH_M, PointsOf, Shown, shown
 from segslam.slam.adjustment.submaps import surfaces_of
 
 APART_M = (20.0, 30.0)
@@ -95,7 +95,8 @@ def measure_vertical_angle(
 
     An angle within `BIAS_DEG` is as they show it. Of a larger one they hide a part: it is the correction that leaves
     none, by a line through what they show without one and with one of twice that. `near`: a measurement with poses that
-    were worse, whose correction and share are used.
+    were worse, whose correction and share are used. None, too, if the angle moves points at the distance of a pair by
+    more than those that are paired may be apart (`SEARCH_M`), 1.3 degrees: such pairs cannot show it.
     `motion_variance` (n,): as of `is_known`, by default of exact poses.
     """
     variance = np.zeros(len(travel_m)) if motion_variance is None else motion_variance
@@ -125,8 +126,10 @@ def measure_vertical_angle(
         share = math.nan if raised is None else (left_deg - float(raised.value[0])) / (2.0 * left_deg)
         if not share > 0.0:
             return None
-    sigma_deg = math.hypot(sigma_deg / share, BIAS_DEG)
-    return VerticalAngle(correction_deg + left_deg / share, sigma_deg, found.num_pairs, share)
+    angle_deg = correction_deg + left_deg / share
+    if math.radians(abs(angle_deg)) * max(APART_M) > SEARCH_M[-1]:
+        return None
+    return VerticalAngle(angle_deg, math.hypot(sigma_deg / share, BIAS_DEG), found.num_pairs, share)
 
 
 class Calibrator:

@@ -12,6 +12,7 @@ from helpers.yards import seen
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.points import voxel_first
+from segslam.core.processes import Progress
 from segslam.core.types import Alignment, LoopClosure, Registration
 from segslam.graph import Edge, PoseGraph
 from segslam.graph.levenberg_marquardt import Unsolvable
@@ -134,19 +135,24 @@ def test_keyframes_without_points_are_not_adjusted() -> None:
     assert adjust(made, made.finish(), lambda _: np.empty((0, 3), np.float32), STILL, config=CONFIG) is None
 
 
-@pytest.mark.parametrize(("angle", "title"), [(None, "refine 1/1"), (VerticalAngle(0.2, 0.01, 40), "refine 1/2")])
-def test_a_second_round_is_announced_only_if_an_angle_is_corrected(
-    angle: VerticalAngle | None, title: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    titles: list[str] = []
+def noting(titles: list[str]) -> Progress:
+    """Progress that notes its titles."""
 
     def shown(items: Iterable[object], total: int, title: str) -> Iterator[object]:
         titles.append(title)
         yield from items
 
+    return shown
+
+
+@pytest.mark.parametrize(("angle", "title"), [(None, "refine 1/1"), (VerticalAngle(0.2, 0.01, 40), "refine 1/2")])
+def test_a_second_round_is_announced_only_if_an_angle_is_corrected(
+    angle: VerticalAngle | None, title: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    titles: list[str] = []
     monkeypatch.setattr(rounds, "measure_vertical_angle", lambda *_, **__: angle)
     made = graph()
-    adjust(made, made.finish(), lambda _: np.empty((0, 3), np.float32), STILL, config=CONFIG, progress=shown)
+    adjust(made, made.finish(), lambda _: np.empty((0, 3), np.float32), STILL, config=CONFIG, progress=noting(titles))
     assert titles == [title]
 
 
@@ -161,12 +167,7 @@ def test_the_angle_of_several_drives_is_that_of_their_own_adjustments(monkeypatc
     made, titles = graph(), list[str]()
     known = Known(T_TRUE, [Correction(0.2)] * NUM, VerticalAngle(0.2, 0.01, 40))
     low = partial(points, low_deg=0.2)
-
-    def shown(items: Iterable[object], total: int, title: str) -> Iterator[object]:
-        titles.append(title)
-        yield from items
-
-    found = adjust(made, made.finish(), low, STILL, config=CONFIG, known=known, progress=shown)
+    found = adjust(made, made.finish(), low, STILL, config=CONFIG, known=known, progress=noting(titles))
     assert found is not None
     assert titles == ["refine 1/2", "refine 2/2"]
     assert found.record.vertical_deg == 0.2

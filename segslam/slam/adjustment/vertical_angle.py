@@ -94,10 +94,10 @@ def measure_vertical_angle(
     """The vertical angle by pairs of submaps that are some metres apart; None if too few pairs determine it.
 
     An angle within `BIAS_DEG` is as they show it. Of a larger one they hide a part: it is the correction that leaves
-    none, by a line through what they show without one and with one of twice that. `near`: a measurement with poses that
-    were worse, whose correction and share are used. None, too, if the angle moves points at the distance of a pair by
-    more than those that are paired may be apart (`SEARCH_M`), 1.3 degrees: such pairs cannot show it.
-    `motion_variance` (n,): as of `is_known`, by default of exact poses.
+    none, by a line through what they show without one and with one of twice that. None, too, above 1.3 degrees: points
+    at the distance of a pair then move by more than paired points may be apart (`SEARCH_M`), so pairs cannot show it.
+    `motion_variance` (n,): as of `is_known`, by default of exact poses. `near`: a measurement with poses that were
+    worse, whose correction and share are used.
     """
     variance = np.zeros(len(travel_m)) if motion_variance is None else motion_variance
     thinned = cache(lambda keyframe_id: downsample(points_of(keyframe_id), config=config))
@@ -122,8 +122,11 @@ def measure_vertical_angle(
     elif abs(left_deg) < BIAS_DEG:
         share = 1.0
     else:
-        raised = left_of(2.0 * left_deg)
-        share = math.nan if raised is None else (left_deg - float(raised.value[0])) / (2.0 * left_deg)
+        tried_deg = 2.0 * left_deg
+        beyond = left_of(tried_deg)
+        if beyond is None:
+            return None
+        share = (left_deg - float(beyond.value[0])) / tried_deg
         if not share > 0.0:
             return None
     angle_deg = correction_deg + left_deg / share

@@ -136,12 +136,13 @@ def calibrate(
 
 
 def _summary(found: "VerticalAngle | None", applied_deg: float, travel_m: float) -> str:
-    from segslam.slam.adjustment.vertical_angle import APART_M, MIN_PAIRS, described
+    from segslam.slam.adjustment.vertical_angle import APART_M, MIN_PAIRS, MOST_DEG, described
 
     if found is None:
         return (
-            f"the vertical angle cannot be measured: fewer than {MIN_PAIRS} usable pairs of scans {APART_M[0]:g} m "
-            f"apart in {travel_m:.0f} m of travel; give a longer drive along a street, or denser scans"
+            f"the vertical angle cannot be measured in {travel_m:.0f} m of travel: at least {MIN_PAIRS} pairs of scans "
+            f"{APART_M[0]:g} m apart must show it, and {MOST_DEG:.1f} degrees at most; give a longer drive along a "
+            "street, or denser scans"
         )
     text = f"{described(found)} ({found.num_pairs} pairs of scans, {applied_deg:g} degrees corrected on reading)"
     if found.is_significant:

@@ -30,6 +30,8 @@ from segslam.slam.adjustment.submaps import surfaces_of
 APART_M = (20.0, 30.0)
 """Travel between the two submaps of a pair, in turn. Chosen on KITTI 00, thin and dense scans; between single scans the
 angle depends on the distance, because the rings of two of them may lie on each other."""
+MOST_DEG = math.degrees(SEARCH_M[-1] / max(APART_M))
+"""1.3 degrees: larger angles move points at the distance of a pair by more than paired points may be apart."""
 MOST_APART = 1.5
 """Pairs are dropped if their straight distance is less than their travel divided by this, or more than their travel
 times this: the sensor stood still, or keyframes are missing."""
@@ -94,8 +96,7 @@ def measure_vertical_angle(
     """The vertical angle by pairs of submaps that are some metres apart; None if too few pairs determine it.
 
     An angle within `BIAS_DEG` is as they show it. Of a larger one they hide a part: it is the correction that leaves
-    none, by a line through what they show without one and with one of twice that. None, too, above 1.3 degrees: points
-    at the distance of a pair then move by more than paired points may be apart (`SEARCH_M`), so pairs cannot show it.
+    none, by a line through what they show without one and with one of twice that; None above `MOST_DEG`.
     `motion_variance` (n,): as of `is_known`, by default of exact poses. `near`: a measurement with poses that were
     worse, whose correction and share are used.
     """
@@ -130,7 +131,7 @@ def measure_vertical_angle(
         if not share > 0.0:
             return None
     angle_deg = correction_deg + left_deg / share
-    if math.radians(abs(angle_deg)) * max(APART_M) > SEARCH_M[-1]:
+    if abs(angle_deg) > MOST_DEG:
         return None
     return VerticalAngle(angle_deg, math.hypot(sigma_deg / share, BIAS_DEG), found.num_pairs, share)
 

@@ -24,14 +24,15 @@ from scipy.special import chdtri
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.probabilities import INLIER_PROBABILITY, SIGNIFICANT
-from segslam.core.types import Information, Motion, MotionState, Scan, Transform
+from segslam.core.types import BadScan, Information, Motion, MotionState, Scan, Transform
 from segslam.graph.edges import BREAK_M
 from segslam.graph.noise import odometry_information
-from segslam.odometry.likelihood import Fit
+from segslam.odometry.likelihood import LEAST_SIGMA_VOXELS, Fit
 from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel
 from segslam.odometry.search import PoseSearch, Recover
-from segslam.odometry.sweep import Foreseeing, Odometry, OdometryResult
+from segslam.odometry.sweep import Foreseeing, Odometry, OdometryResult, swept_by
+from segslam.odometry.sweep_motion import SweepMotion, at_end
 from segslam.registration.refinement import SHARED_NOISE
 
 ELSEWHERE_M = 30.0
@@ -49,13 +50,21 @@ of 15 degrees a scan are then within the reach of the search."""
 class Proposed(NamedTuple):
     """A scan, and its expected pose before it is compared with the last ones."""
 
+    raw: Scan
+    result: OdometryResult
+    """Of the odometry, perhaps with the points moved by another motion during the sweep."""
     scan: SeenScan
+    """The points of the result."""
     T_odom_lidar: Transform
     """By the odometry."""
     T_odom_predicted: Transform
     """By the last motions."""
     gap: float
     """Time since the previous scan, in intervals of the sensor."""
+
+    def at(self, T_odom_lidar: Transform, motion: Motion) -> OdometryResult:
+        """The result with this pose."""
+        return replace(self.result, T_odom_lidar=T_odom_lidar, motion=motion)
 
 
 class CheckedOdometry:
@@ -79,6 +88,7 @@ class CheckedOdometry:
         self._T_odom_inner: Transform = np.eye(4)
         """Pose of the frame in which the inner odometry continues, undisturbed by small corrections."""
         self._num_unchecked = 0
+        self._sweeps = SweepMotion()
         self._offs: deque[float] = deque(maxlen=WINDOW)
         """Chi-squares of the odometry's poses, compared with registered ones, since the last repair."""
 
@@ -88,22 +98,47 @@ class CheckedOdometry:
         `ahead`: the scan to be registered after it, if it is known.
         """
         gap = max(gap, self._intervals.gap(scan.stamp_ns))
-        proposed = self._inner.register(scan, gap=gap)
+        result = self._inner.register(scan, gap=gap)
         self._intervals.note(scan.stamp_ns)
         if ahead is not None and ahead.stamp_ns > scan.stamp_ns and isinstance(self._inner, Foreseeing):
             self._inner.foresee(ahead, gap=self._intervals.gap(ahead.stamp_ns))
         if not self._config.health.check:
-            return proposed
+            return result
         is_watched = self._is_watched
         T_odom_predicted = self._T_odom_last @ self._motion.predicted(gap)
-        seen = SeenScan(proposed.points, self._config.refine)
-        T_odom_lidar, motion = self._checked(
-            Proposed(seen, self._T_odom_inner @ proposed.T_odom_lidar, T_odom_predicted, gap)
-        )
+        seen = SeenScan(result.points, self._config.refine)
+        proposed = Proposed(scan, result, seen, self._T_odom_inner @ result.T_odom_lidar, T_odom_predicted, gap)
+        if not self._is_sudden(proposed) and (swept := self._swept(proposed, proposed.T_odom_lidar)):
+            proposed, _ = swept
+        checked = self._checked(proposed)
+        assert checked.motion
+        T_odom_lidar, state = checked.T_odom_lidar, checked.motion.state
+        if checked.T_sweep is not None:
+            self._sweeps.note(T_odom_lidar, checked.T_sweep, gap, is_break=state is MotionState.BROKEN)
         self._T_odom_last = T_odom_lidar
-        if is_watched and motion.state is MotionState.REFINED:
-            self._T_odom_inner = geometry.nearest_transform(T_odom_lidar @ geometry.inverse(proposed.T_odom_lidar))
-        return replace(proposed, T_odom_lidar=T_odom_lidar, motion=motion)
+        if is_watched and state is MotionState.REFINED:
+            T_inner_lidar = at_end(result.T_odom_lidar, result.T_sweep, checked.T_sweep)
+            self._T_odom_inner = geometry.nearest_transform(T_odom_lidar @ geometry.inverse(T_inner_lidar))
+        return checked
+
+    def _swept(self, proposed: Proposed, T_odom_lidar: Transform) -> tuple[Proposed, Transform] | None:
+        """With the points moved by the motion during the sweep that a pose shows, and this pose then.
+
+        None if they have no times, or hardly differ.
+        """
+        before = proposed.result.T_sweep
+        T_sweep = None if before is None else self._sweeps.motion(T_odom_lidar, before, proposed.gap)
+        if before is None or T_sweep is None:
+            return None
+        if geometry.displacement_m(proposed.scan.moments, before, T_sweep) < LEAST_SIGMA_VOXELS * self._map.voxel_m:
+            return None
+        try:
+            result = swept_by(proposed.raw, proposed.result, T_sweep, self._config.odometry)
+        except BadScan:  # no point is within range then
+            return None
+        scan = SeenScan(result.points, self._config.refine)
+        T_odom_proposed, T_odom_end = (at_end(T, before, T_sweep) for T in (proposed.T_odom_lidar, T_odom_lidar))
+        return proposed._replace(result=result, scan=scan, T_odom_lidar=T_odom_proposed), T_odom_end
 
     @property
     def _is_watched(self) -> bool:
@@ -111,18 +146,18 @@ class CheckedOdometry:
         agrees = len(self._offs) == WINDOW and sum(self._offs) < MOST_OFF_TOGETHER
         return self._inner.is_from_scans and not agrees
 
-    def _checked(self, proposed: Proposed) -> tuple[Transform, Motion]:
-        """The pose of a scan and the result of its check, if one is due."""
+    def _checked(self, proposed: Proposed) -> OdometryResult:
+        """The scan with its pose and the result of its check, if one is due."""
         if not self._is_due(proposed):
             self._num_unchecked += 1
             self._motion.follow(self._since_last(proposed.T_odom_lidar), proposed.gap)
-            return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
+            return proposed.at(proposed.T_odom_lidar, Motion(MotionState.UNCHECKED))
         self._num_unchecked = 0
         if proposed.scan.is_small:
             return self._of_few_points(proposed)
         if len(self._map) == 0:
             self._map.add(proposed.T_odom_lidar, proposed.scan)
-            return proposed.T_odom_lidar, Motion(MotionState.UNCHECKED)
+            return proposed.at(proposed.T_odom_lidar, Motion(MotionState.UNCHECKED))
         confirmed = None if self._is_watched or proposed.gap > 1.0 else self._confirmed(proposed)
         return confirmed or self._registered(proposed)
 
@@ -135,12 +170,15 @@ class CheckedOdometry:
             return True
         if proposed.scan.is_small:
             return True
-        moments = proposed.scan.moments
-        moved_m = geometry.displacement_m(moments, proposed.T_odom_lidar, self._map.T_odom_map)
-        sudden_m = geometry.displacement_m(moments, proposed.T_odom_lidar, proposed.T_odom_predicted)
-        return moved_m >= self._config.keyframes.distance_m or sudden_m >= self._map.voxel_m
+        moved_m = geometry.displacement_m(proposed.scan.moments, proposed.T_odom_lidar, self._map.T_odom_map)
+        return moved_m >= self._config.keyframes.distance_m or self._is_sudden(proposed)
 
-    def _confirmed(self, proposed: Proposed) -> tuple[Transform, Motion] | None:
+    def _is_sudden(self, proposed: Proposed) -> bool:
+        """True if the motion is unlike the last one."""
+        sudden_m = geometry.displacement_m(proposed.scan.moments, proposed.T_odom_lidar, proposed.T_odom_predicted)
+        return sudden_m >= self._map.voxel_m
+
+    def _confirmed(self, proposed: Proposed) -> OdometryResult | None:
         """The proposed pose, if a few steps to the last checked scan leave it and fit as usual; else None."""
         T_map_proposed = self._map.pose_of(proposed.T_odom_lidar)
         found = self._map.check(proposed.scan, T_map_proposed)
@@ -158,13 +196,18 @@ class CheckedOdometry:
         self._offs.append(off)
         _, covariance = self._motion.update(T_last_lidar, self._covariance(found), proposed.gap)
         self._map.add(proposed.T_odom_lidar, proposed.scan)
-        return proposed.T_odom_lidar, self._result(MotionState.CONFIRMED, T_map_proposed, found, covariance)
+        return proposed.at(
+            proposed.T_odom_lidar, self._result(MotionState.CONFIRMED, T_map_proposed, found, covariance)
+        )
 
-    def _registered(self, proposed: Proposed) -> tuple[Transform, Motion]:
+    def _registered(self, proposed: Proposed) -> OdometryResult:
         """The most likely pose of the scan in the local map."""
-        scan, gap, before = proposed.scan, proposed.gap, self._map
+        gap, before = proposed.gap, self._map
         search, fits = self._poses(proposed)
         is_rejoined = self._map is not before
+        if not is_rejoined:
+            proposed, search, fits = self._sharpened(proposed, search, fits)
+        scan = proposed.scan
         T_odom_map, T_map_proposed = self._map.T_odom_map, self._map.pose_of(proposed.T_odom_lidar)
         by_chance = 0.0
         elsewhere = float(is_rejoined)  # the scan before is not in the map before a break
@@ -200,23 +243,25 @@ class CheckedOdometry:
             self._motion.begin_map()
         self._map.add(T_odom_lidar, scan)
         self._follow(state, T_odom_lidar)
-        return T_odom_lidar, self._result(state, T_map_proposed, best, covariance)
+        return proposed.at(T_odom_lidar, self._result(state, T_map_proposed, best, covariance))
 
-    def _of_few_points(self, proposed: Proposed) -> tuple[Transform, Motion]:
+    def _of_few_points(self, proposed: Proposed) -> OdometryResult:
         """The pose of a scan with too few points to show its motion: that of other sensors, or the predicted one.
 
         KISS-ICP aligns even a few points, at any pose.
         """
         T_odom_lidar, gap = proposed.T_odom_lidar, proposed.gap
         if not self._inner.is_from_scans or not self._motion.predicts:
-            return T_odom_lidar, Motion(MotionState.UNCHECKED)
+            return proposed.at(T_odom_lidar, Motion(MotionState.UNCHECKED))
         T_last_lidar, covariance = self._motion.update(self._motion.predicted(gap), np.diag(ANYWHERE**2), gap)
         T_odom_continued = geometry.nearest_transform(self._T_odom_last @ T_last_lidar)
         state = self._state(_off(T_odom_continued, covariance, T_odom_lidar), covariance, is_unlikely=True)
         if state is not MotionState.CONFIRMED:
             T_odom_lidar = T_odom_continued
         self._follow(state, T_odom_lidar)
-        return T_odom_lidar, Motion(state, information=self._own_information(covariance), covariance=covariance)
+        return proposed.at(
+            T_odom_lidar, Motion(state, information=self._own_information(covariance), covariance=covariance)
+        )
 
     def _follow(self, state: MotionState, T_odom_lidar: Transform) -> None:
         """Let the odometry continue from the pose and the local map here, if its own pose was replaced."""
@@ -226,12 +271,7 @@ class CheckedOdometry:
 
     def _poses(self, proposed: Proposed) -> tuple[PoseSearch, list[Fit]]:
         """Poses in the local map, which may be that before a break again, the most likely first; and their search."""
-        T_last_map = self._since_last(self._map.T_odom_map)
-
-        def prior(fit: Fit) -> float:
-            return self._motion.log_prior(T_last_map @ fit.T_map_lidar, self._covariance(fit), proposed.gap)
-
-        search = PoseSearch(self._map, proposed.scan, prior=prior)
+        search = self._search(proposed)
         starts = [self._map.pose_of(T) for T in (proposed.T_odom_lidar, proposed.T_odom_predicted)]
         fits = search.near(starts)
         rejoined = self._rejoined(proposed, fits)
@@ -244,6 +284,28 @@ class CheckedOdometry:
         if not self._is_found(search, fits, starts):
             fits = search.around(T_map_last, self._since_last(proposed.T_odom_predicted), fits)
         return search, fits
+
+    def _search(self, proposed: Proposed) -> PoseSearch:
+        """The search in the local map, where motions like the last ones are more probable."""
+        T_last_map = self._since_last(self._map.T_odom_map)
+
+        def prior(fit: Fit) -> float:
+            return self._motion.log_prior(T_last_map @ fit.T_map_lidar, self._covariance(fit), proposed.gap)
+
+        return PoseSearch(self._map, proposed.scan, prior=prior)
+
+    def _sharpened(
+        self, proposed: Proposed, search: PoseSearch, fits: list[Fit]
+    ) -> tuple[Proposed, PoseSearch, list[Fit]]:
+        """The same with the points moved by the motion that was found, as often as this explains the scan better."""
+        while fits and (swept := self._swept(proposed, self._map.T_odom_map @ fits[0].T_map_lidar)):
+            moved, T_odom_start = swept
+            again = self._search(moved)
+            found = again.near([self._map.pose_of(T_odom_start)], fits[1:])
+            if not found or found[0].mean_log <= fits[0].mean_log:
+                break
+            proposed, search, fits = moved, again, found
+        return proposed, search, fits
 
     def _since_last(self, T_odom_lidar: Transform) -> Transform:
         """The motion since the last scan."""
@@ -278,13 +340,13 @@ class CheckedOdometry:
         others = [*near, self._map.fit(proposed.scan, T_map_proposed)]
         return all(_is_significant(search, fits[0], fit) for fit in others)
 
-    def _kept(self, proposed: Proposed, best: Fit, *, is_unsure: bool) -> tuple[Transform, Motion]:
+    def _kept(self, proposed: Proposed, best: Fit, *, is_unsure: bool) -> OdometryResult:
         """The pose of an odometry of other sensors, which the scans do not contradict."""
         T_map_proposed = self._map.pose_of(proposed.T_odom_lidar)
         self._map.add(proposed.T_odom_lidar, proposed.scan)
         self._motion.restart(geometry.scaled(self._since_last(proposed.T_odom_lidar), 1.0 / proposed.gap))
         state = MotionState.UNCHECKED if is_unsure else MotionState.CONFIRMED
-        return proposed.T_odom_lidar, self._result(state, T_map_proposed, best, None)
+        return proposed.at(proposed.T_odom_lidar, self._result(state, T_map_proposed, best, None))
 
     def _rejoined(self, proposed: Proposed, here: Sequence[Fit]) -> tuple[PoseSearch, list[Fit]] | None:
         """Poses in the map before a break, if it explains the scan as usual and at least as well as `here`.

@@ -10,7 +10,7 @@ from segslam.core import geometry
 from segslam.core.config import OdometryConfig
 from segslam.core.types import BadScan, Points, Scan, Transform
 from segslam.odometry.aligner import KissAligner
-from segslam.odometry.sweep import OdometryResult, PosedScans, Swept, deskew_scan
+from segslam.odometry.sweep import OdometryResult, PosedScans, Swept, deskew_scan, is_swept
 
 
 class KissOdometry:
@@ -38,9 +38,10 @@ class KissOdometry:
         (points, labels, intensities), T_odom_lidar = self._aligned(scan, gap)
         if self._keeps_alone:
             self._register_alone(scan, points, T_odom_lidar, gap)
+        T_sweep = self._T_last_lidar if is_swept(scan, self._config) else None
         self._T_last_lidar = geometry.scaled(_since(self._T_odom_last, T_odom_lidar), 1 / gap)
         self._T_odom_last = T_odom_lidar
-        return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
+        return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities, T_sweep=T_sweep)
 
     def _aligned(self, scan: Scan, gap: float) -> tuple[Swept, Transform]:
         """The points of the next scan, and its pose."""

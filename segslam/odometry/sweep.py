@@ -1,7 +1,7 @@
 """Interface of all odometries: scans in, poses and motion-compensated, cropped points out; and a given trajectory."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -33,6 +33,8 @@ class OdometryResult:
     """(n,) intensities; None if unknown."""
     motion: Motion | None = None
     """Result of the check of the motion; None if it was not checked."""
+    T_sweep: Transform | None = None
+    """Motion during the sweep by which the points were moved to its end; None if they were not moved."""
 
 
 @runtime_checkable
@@ -78,7 +80,7 @@ def deskew_scan(scan: Scan, T_last_lidar: Transform, config: OdometryConfig) -> 
     Points are cropped after the motion compensation, as in KISS-ICP, which would crop without the labels.
     `T_last_lidar`: motion of the sensor during the sweep.
     """
-    points = _at_sweep_end(scan, T_last_lidar, config) if config.deskew else scan.points.astype(np.float64)
+    points = _at_sweep_end(scan, T_last_lidar, config)
     kept = within_range(points, config.min_range_m, config.max_range_m)
     if not kept.any():
         raise BadScan(
@@ -89,10 +91,21 @@ def deskew_scan(scan: Scan, T_last_lidar: Transform, config: OdometryConfig) -> 
     return points.compress(kept, axis=0), of_rows(scan.labels, kept), intensities
 
 
+def swept_by(scan: Scan, result: OdometryResult, T_sweep: Transform, config: OdometryConfig) -> OdometryResult:
+    """The result with the points moved by another motion during the sweep. Raises BadScan as `deskew_scan`."""
+    points, labels, intensities = deskew_scan(scan, T_sweep, config)
+    return replace(result, points=points.astype(np.float32), labels=labels, intensities=intensities, T_sweep=T_sweep)
+
+
+def is_swept(scan: Scan, config: OdometryConfig) -> bool:
+    """True if the points of a scan are moved to the end of its sweep."""
+    return config.deskew and len(scan.times) > 0 and bool(np.ptp(scan.times) > 0)
+
+
 def _at_sweep_end(scan: Scan, T_last_lidar: Transform, config: OdometryConfig) -> Points:
     """The points as measured at the end of the sweep, if the sensor moves by `T_last_lidar` during it."""
     points = scan.points.astype(np.float64)
-    if len(scan.times) == 0 or np.ptp(scan.times) == 0:
+    if not is_swept(scan, config):
         return points
     everything = Preprocessor(max_range=np.inf, min_range=-1.0, deskew=True, max_num_threads=config.max_num_threads)
     finite = is_finite(points)  # KISS-ICP drops other points, which would change the order of the rows
@@ -126,9 +139,8 @@ class GivenOdometry:
         T_given_lidar = self._trajectory.T_world_lidar[self._row(scan)]
         T_odom_given = geometry.inverse(T_given_lidar) if self._T_odom_given is None else self._T_odom_given
         T_odom_lidar = T_odom_given @ T_given_lidar
-        points, labels, intensities = deskew_scan(
-            scan, geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_lidar, 1 / gap), self._config
-        )
+        T_sweep = geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_lidar, 1 / gap)
+        points, labels, intensities = deskew_scan(scan, T_sweep, self._config)
         self._T_odom_given, self._T_odom_last, self._T_given_last = T_odom_given, T_odom_lidar, T_given_lidar
         return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
 

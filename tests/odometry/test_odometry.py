@@ -15,6 +15,7 @@ from segslam.core.types import BadScan, Scan, SegslamError, Trajectory
 from segslam.odometry.apart import OdometryApart
 from segslam.odometry.kiss import KissOdometry
 from segslam.odometry.sweep import GivenOdometry, deskew_scan
+from segslam.odometry.sweep_motion import SweepMotion, at_end
 
 CONFIG = OdometryConfig()
 ONE_THREAD = OdometryConfig(max_num_threads=1)  # the first odometry of a process sets how many all of it have
@@ -317,3 +318,28 @@ def test_a_sweep_whose_seam_has_no_returns_is_not_stretched() -> None:
     moved = deskew_scan(scan, T_last_lidar, OdometryConfig())[0]
     np.testing.assert_allclose(moved[:, 0] - points[:, 0], times - 1.0, atol=1e-5)
     np.testing.assert_allclose(moved[:, 1:], points[:, 1:], atol=1e-5)
+
+
+def test_the_motion_during_a_sweep_does_not_depend_on_that_by_which_its_points_were_moved_before() -> None:
+    """A sensor that accelerates; the ends of its sweeps are off, because their points were moved by wrong motions."""
+    rng = np.random.default_rng(2)
+    sweeps = SweepMotion()
+    for time in range(1, 12):
+        T_true_sweep = _forward(0.1 * time**2 - 0.1 * (time - 1) ** 2)
+        T_wrong = geometry.exp(0.3 * rng.standard_normal(6))
+        T_odom_lidar = at_end(_forward(0.1 * time**2), T_true_sweep, T_wrong)
+        found = sweeps.motion(T_odom_lidar, T_wrong, 1.0)
+        if time > 2:
+            assert found is not None
+            np.testing.assert_allclose(found, T_true_sweep, atol=0.03)
+            np.testing.assert_allclose(at_end(T_odom_lidar, T_wrong, found), _forward(0.1 * time**2), atol=0.03)
+        sweeps.note(T_odom_lidar, T_wrong, 1.0, is_break=False)
+    jump, step = geometry.transform(geometry.yaw(1.0), [40.0, 0.0, 0.0]), _forward(2.0)
+    sweeps.note(T_odom_lidar @ jump, step, 1.0, is_break=True)
+    after = sweeps.motion(T_odom_lidar @ jump @ step, step, 1.0)
+    assert after is not None
+    np.testing.assert_allclose(after, step, atol=1e-9)
+
+
+def test_no_motion_during_the_first_sweep_is_known() -> None:
+    assert SweepMotion().motion(_forward(1.0), _forward(0.5), 1.0) is None

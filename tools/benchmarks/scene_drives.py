@@ -17,7 +17,7 @@ from segslam.core import geometry
 from segslam.core.types import Points
 from tools.benchmarks import common
 from tools.benchmarks.altered import Altered, mapped
-from tools.benchmarks.scene_models import SCENES, SENSORS, scan_points
+from tools.benchmarks.scene_models import SCENES, SENSORS, continuous_path, scan_points
 
 STEP_M, TURN_DEG, INTERVAL_S = 0.4, 12.0, 0.1
 SWAY = geometry.tangent(rotation_rad=np.radians([1.2, 1.2, 2.0]), translation_m=[0.05, 0.05, 0.03])
@@ -29,9 +29,7 @@ NOISE_M = 0.02
 def driven(name: str, sensor: str, seed: int, stride: int) -> Altered:
     """A drive along the path of a scene, as far as it leads without a jump, and back."""
     scene = SCENES[name](seed)
-    steps_m = np.linalg.norm(np.diff(scene.path[:, :3], axis=0), axis=1)
-    path = scene.path[: 1 + int(np.argmax([*(steps_m > 2.0), True]))]
-    along_m = np.concatenate([[0.0], np.cumsum(steps_m[: len(path) - 1])])
+    path, along_m = continuous_path(scene)
     there = np.column_stack([np.interp(np.arange(0.0, along_m[-1], STEP_M), along_m, column) for column in path.T])
     turn = np.tile(there[-1], (round(180.0 / TURN_DEG) - 1, 1))
     turn[:, 3] += np.radians(TURN_DEG) * np.arange(1, len(turn) + 1)

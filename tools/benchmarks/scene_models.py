@@ -171,18 +171,33 @@ def pose(scene: Scene, row: int, rng: np.random.Generator, *, turned: bool = Fal
     return geometry.transform(geometry.yaw(heading + np.pi * turned), np.array([x, y, z]) + side) @ tilt
 
 
+def continuous_path(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """The path of a scene (n, 4) as far as it leads without a jump, and the distance along it (n,)."""
+    steps_m = np.linalg.norm(np.diff(scene.path[:, :3], axis=0), axis=1)
+    path = scene.path[: 1 + int(np.argmax([*(steps_m > 2.0), True]))]
+    return path, np.concatenate([[0.0], np.cumsum(steps_m[: len(path) - 1])])
+
+
 def scan_points(
     scene: Scene, sensor: str, T_world_lidar: Transform, *, noise_m: float, rng: np.random.Generator
 ) -> Points:
     """One sweep (n, 3), float32, in the sensor's frame, with range noise and lost returns."""
-    rays = _rays(sensor, rng)
-    ranges = cast_mesh(scene.rays, scene.mesh, rays_of(T_world_lidar, rays)).range_m
+    beams = beams_of(sensor, rng)
+    return measured(scene, beams, rays_of(T_world_lidar, beams), noise_m=noise_m, rng=rng)[0]
+
+
+def measured(
+    scene: Scene, beams: Points, rays: np.ndarray, *, noise_m: float, rng: np.random.Generator
+) -> tuple[Points, np.ndarray]:
+    """Points (n, 3), float32, of the beams that return, and which these are; `rays`: of each beam, in the world."""
+    ranges = cast_mesh(scene.rays, scene.mesh, rays).range_m
     seen = (ranges > MIN_RANGE_M) & (ranges < MAX_RANGE_M) & (rng.random(len(rays)) > DROPOUT)
     ranges = ranges[seen] + rng.normal(scale=noise_m, size=int(seen.sum()))
-    return (rays[seen] * ranges[:, None]).astype(np.float32)
+    return (beams[seen] * ranges[:, None]).astype(np.float32), seen
 
 
-def _rays(sensor: str, rng: np.random.Generator) -> Points:
+def beams_of(sensor: str, rng: np.random.Generator) -> Points:
+    """Directions (n, 3) of the beams of one sweep."""
     beams, (low_deg, high_deg), width_deg = SENSORS[sensor]
     half = math.radians(width_deg) / 2
     if beams:

@@ -1,0 +1,54 @@
+"""The motion of the sensor during a sweep, by which the points of the sweep are moved to its end."""
+
+from segslam.core import geometry
+from segslam.core.types import Tangent, Transform
+
+
+class SweepMotion:
+    """The motion during a sweep, by the poses of the sensor at the middle of this and of the last two sweeps.
+
+    A registration shows where the sensor was at the middle of a sweep, by whatever motion its points are moved to the
+    end; the pose at the end has half the error of that motion. Motions from end to end would never lose such an error:
+    if one end is too far ahead, the next is as far behind.
+    """
+
+    def __init__(self) -> None:
+        self._T_odom_middle: Transform | None = None
+        self._step: Tangent | None = None
+        """Motion per interval between the last two middles."""
+
+    def motion(self, T_odom_lidar: Transform, T_sweep: Transform, gap: float) -> Transform | None:
+        """The motion during a sweep whose points were moved by `T_sweep` and registered; None without a last sweep.
+
+        It is that at the middle, by the backward difference of second order.
+        """
+        step = self._step_to(at_middle(T_odom_lidar, T_sweep), gap)
+        if step is None:
+            return None
+        return geometry.exp(step if self._step is None or gap > 1.0 else 1.5 * step - 0.5 * self._step)
+
+    def note(self, T_odom_lidar: Transform, T_sweep: Transform, gap: float, *, is_break: bool) -> None:
+        """Note the pose of a sweep; the motion to one after a break is unknown."""
+        T_odom_middle = at_middle(T_odom_lidar, T_sweep)
+        self._step = None if is_break else self._step_to(T_odom_middle, gap)
+        self._T_odom_middle = T_odom_middle
+
+    def _step_to(self, T_odom_middle: Transform, gap: float) -> Tangent | None:
+        if self._T_odom_middle is None:
+            return None
+        return geometry.log(geometry.inverse(self._T_odom_middle) @ T_odom_middle) / gap
+
+
+def at_middle(T_odom_lidar: Transform, T_sweep: Transform) -> Transform:
+    """The pose at the middle of a sweep, from that at its end."""
+    return T_odom_lidar @ geometry.scaled(T_sweep, -0.5)
+
+
+def at_end(T_odom_lidar: Transform, before: Transform | None, T_sweep: Transform | None) -> Transform:
+    """The pose at the end of a sweep whose points are moved by `T_sweep` now, from that when they were by `before`.
+
+    It stays the same if they are not moved.
+    """
+    if before is None or T_sweep is None or before is T_sweep:
+        return T_odom_lidar
+    return geometry.nearest_transform(at_middle(T_odom_lidar, before) @ geometry.scaled(T_sweep, 0.5))

@@ -324,12 +324,12 @@ def test_the_motion_during_a_sweep_does_not_depend_on_that_by_which_its_points_w
     """A sensor that accelerates; the ends of its sweeps are off, because their points were moved by wrong motions."""
     rng = np.random.default_rng(2)
     sweeps = SweepMotion()
-    for time in range(1, 12):
+    for time in range(1, 14):
         T_true_sweep = _forward(0.1 * time**2 - 0.1 * (time - 1) ** 2)
         T_wrong = geometry.exp(0.3 * rng.standard_normal(6))
         T_odom_lidar = at_end(_forward(0.1 * time**2), T_true_sweep, T_wrong)
         found = sweeps.motion(T_odom_lidar, T_wrong, 1.0)
-        if time > 2:
+        if time > 8:  # the acceleration is known then
             assert found is not None
             np.testing.assert_allclose(found, T_true_sweep, atol=0.03)
             np.testing.assert_allclose(at_end(T_odom_lidar, T_wrong, found), _forward(0.1 * time**2), atol=0.03)
@@ -339,6 +339,19 @@ def test_the_motion_during_a_sweep_does_not_depend_on_that_by_which_its_points_w
     after = sweeps.motion(T_odom_lidar @ jump @ step, step, 1.0)
     assert after is not None
     np.testing.assert_allclose(after, step, atol=1e-9)
+
+
+def test_noise_of_the_poses_is_no_acceleration() -> None:
+    """By the two last middles, the motion has the noise of both, 1.4 of that of a pose; by three of them 2.5."""
+    rng = np.random.default_rng(3)
+    sweeps, steady, errors_m = SweepMotion(), _forward(1.0), []
+    for time in range(60):
+        T_odom_lidar = geometry.transform(np.eye(3), [time, *(0.05 * rng.standard_normal(2))])
+        found = sweeps.motion(T_odom_lidar, steady, 1.0)
+        if found is not None and time > 10:
+            errors_m.append(found[1:3, 3])
+        sweeps.note(T_odom_lidar, steady, 1.0, is_break=False)
+    assert np.std(errors_m) < 1.7 * 0.05
 
 
 def test_no_motion_during_the_first_sweep_is_known() -> None:

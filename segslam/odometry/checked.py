@@ -32,7 +32,7 @@ from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel
 from segslam.odometry.search import PoseSearch, Recover
 from segslam.odometry.sweep import Foreseeing, Odometry, OdometryResult, swept_by
-from segslam.odometry.sweep_motion import SweepMotion, at_end
+from segslam.odometry.sweep_motion import SweepMotion, at_end, at_middle
 from segslam.registration.refinement import SHARED_NOISE
 
 ELSEWHERE_M = 30.0
@@ -114,10 +114,11 @@ class CheckedOdometry:
         assert checked.motion
         T_odom_lidar, state = checked.T_odom_lidar, checked.motion.state
         if checked.T_sweep is not None:
-            self._sweeps.note(T_odom_lidar, checked.T_sweep, gap, is_break=state is MotionState.BROKEN)
+            T_odom_middle = at_middle(scan, T_odom_lidar, checked.T_sweep)
+            self._sweeps.note(T_odom_middle, gap, is_break=state is MotionState.BROKEN)
         self._T_odom_last = T_odom_lidar
         if is_watched and state is MotionState.REFINED:
-            T_inner_lidar = at_end(result.T_odom_lidar, result.T_sweep, checked.T_sweep)
+            T_inner_lidar = at_end(scan, result.T_odom_lidar, result.T_sweep, checked.T_sweep)
             self._T_odom_inner = geometry.nearest_transform(T_odom_lidar @ geometry.inverse(T_inner_lidar))
         return checked
 
@@ -126,18 +127,20 @@ class CheckedOdometry:
 
         None if they have no times, or hardly differ.
         """
-        before = proposed.result.T_sweep
-        T_sweep = None if before is None else self._sweeps.motion(T_odom_lidar, before, proposed.gap)
-        if before is None or T_sweep is None:
+        raw, before = proposed.raw, proposed.result.T_sweep
+        if before is None:
+            return None
+        T_sweep = self._sweeps.motion(at_middle(raw, T_odom_lidar, before), proposed.gap)
+        if T_sweep is None:
             return None
         if geometry.displacement_m(proposed.scan.moments, before, T_sweep) < LEAST_SIGMA_VOXELS * self._map.voxel_m:
             return None
         try:
-            result = swept_by(proposed.raw, proposed.result, T_sweep, self._config.odometry)
+            result = swept_by(raw, proposed.result, T_sweep, self._config.odometry)
         except BadScan:  # no point is within range then
             return None
         scan = SeenScan(result.points, self._config.refine)
-        T_odom_proposed, T_odom_end = (at_end(T, before, T_sweep) for T in (proposed.T_odom_lidar, T_odom_lidar))
+        T_odom_proposed, T_odom_end = (at_end(raw, T, before, T_sweep) for T in (proposed.T_odom_lidar, T_odom_lidar))
         return proposed._replace(result=result, scan=scan, T_odom_lidar=T_odom_proposed), T_odom_end
 
     @property

@@ -6,16 +6,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.types import Tangent, Transform
+from segslam.core.types import Scan, Tangent, Transform
 from segslam.odometry.motion_model import LEAST_KNOWN, WINDOW
 
 
 class SweepMotion:
     """The motion during a sweep, by the poses of the sensor at the middle of this and of the last two sweeps.
 
-    A registration shows where the sensor was at the middle of a sweep, by whatever motion its points are moved to the
-    end; the pose at the end has half the error of that motion. Motions from end to end would never lose such an error:
-    if one end is too far ahead, the next is as far behind.
+    The middle is the mean time of the points. A registration shows where the sensor was then, by whatever motion its
+    points are moved to the end; the pose at the end has half the error of that motion. Motions from end to end would
+    never lose such an error: if one end is too far ahead, the next is as far behind.
     """
 
     def __init__(self) -> None:
@@ -25,12 +25,12 @@ class SweepMotion:
         self._changes: deque[Tangent] = deque(maxlen=WINDOW)
         """Of these motions, from each to the next."""
 
-    def motion(self, T_odom_lidar: Transform, T_sweep: Transform, gap: float) -> Transform | None:
-        """The motion during a sweep whose points were moved by `T_sweep` and registered; None without a last sweep.
+    def motion(self, T_odom_middle: Transform, gap: float) -> Transform | None:
+        """The motion per interval at the middle of a sweep; None without a last sweep.
 
         It is the motion since the last middle, and half as much of its change as is not noise.
         """
-        step = self._step_to(at_middle(T_odom_lidar, T_sweep), gap)
+        step = self._step_to(T_odom_middle, gap)
         if step is None:
             return None
         if self._step is None or gap > 1.0:
@@ -38,9 +38,8 @@ class SweepMotion:
         change = step - self._step
         return geometry.exp(step + 0.5 * _steady_share([*self._changes, change]) * change)
 
-    def note(self, T_odom_lidar: Transform, T_sweep: Transform, gap: float, *, is_break: bool) -> None:
-        """Note the pose of a sweep; the motion to one after a break is unknown."""
-        T_odom_middle = at_middle(T_odom_lidar, T_sweep)
+    def note(self, T_odom_middle: Transform, gap: float, *, is_break: bool) -> None:
+        """Note the pose at the middle of a sweep; the motion to one after a break is unknown."""
         step = None if is_break else self._step_to(T_odom_middle, gap)
         if step is not None and self._step is not None:
             self._changes.append(step - self._step)
@@ -66,16 +65,17 @@ def _steady_share(changes: Sequence[Tangent]) -> Tangent:
     return np.clip(0.4 + 0.6 * ratio, 0.0, 1.0)
 
 
-def at_middle(T_odom_lidar: Transform, T_sweep: Transform) -> Transform:
-    """The pose at the middle of a sweep, from that at its end."""
-    return T_odom_lidar @ geometry.scaled(T_sweep, -0.5)
+def at_middle(scan: Scan, T_odom_lidar: Transform, T_sweep: Transform) -> Transform:
+    """The pose at the middle of a sweep, from that at its end, to which its points are moved by `T_sweep`."""
+    return T_odom_lidar @ geometry.scaled(T_sweep, float(np.mean(scan.times)) - 1.0)
 
 
-def at_end(T_odom_lidar: Transform, before: Transform | None, T_sweep: Transform | None) -> Transform:
+def at_end(scan: Scan, T_odom_lidar: Transform, before: Transform | None, T_sweep: Transform | None) -> Transform:
     """The pose at the end of a sweep whose points are moved by `T_sweep` now, from that when they were by `before`.
 
     It stays the same if they are not moved.
     """
     if before is None or T_sweep is None or before is T_sweep:
         return T_odom_lidar
-    return geometry.nearest_transform(at_middle(T_odom_lidar, before) @ geometry.scaled(T_sweep, 0.5))
+    T_odom_middle = at_middle(scan, T_odom_lidar, before)
+    return geometry.nearest_transform(T_odom_middle @ geometry.inverse(at_middle(scan, np.eye(4), T_sweep)))

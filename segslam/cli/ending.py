@@ -140,5 +140,6 @@ def _adjustment(metrics: dict[str, Any]) -> str:
     if "vertical_correction_deg" in metrics:
         line += f"; points raised by {metrics['vertical_correction_deg']:.2f} degrees, the measured vertical angle"
     if "sweep_s" in metrics:
-        line += f"; points corrected for the motion within sweeps of {abs(metrics['sweep_s']):.2f} s, as measured"
+        milliseconds = round(1e3 * abs(metrics["sweep_s"]))
+        line += f"; points corrected for the motion within sweeps of {milliseconds} ms, as measured"
     return line

@@ -50,7 +50,7 @@ def test_the_motion_within_sweeps_is_corrected_in_the_run_and_in_its_map(
     monkeypatch.setattr(rounds, "measure_sweep", lambda *_, **__: Sweep(-0.1, 0.002, 180.0))
     folder = tmp_path / "refined"
     assert run("refine", log, "--out", folder, "--refine-minutes", 5) == 0
-    assert "; points corrected for the motion within sweeps of 0.10 s, as measured" in capsys.readouterr().err
+    assert "; points corrected for the motion within sweeps of 100 ms, as measured" in capsys.readouterr().err
     metrics = read_metrics(folder)
     assert (metrics["sweep_s"], metrics["sweep_sigma_s"]) == (-0.1, 0.002)
     keyframes = [(row, step.keyframe) for row, step in enumerate(read_log(folder).steps()) if step.keyframe is not None]

@@ -178,6 +178,8 @@ class Scan(Record):
     """Per point, in the sensor's own unit; None if unknown or not requested."""
     kept: Mask | None
     """Rows of the file that the points were read from; None for all rows."""
+    sweep_s: float
+    """Duration from 0 to 1 of the times (s); 0 if unknown: the time between two scans."""
 
     def __init__(
         self,
@@ -188,11 +190,12 @@ class Scan(Record):
         times: ArrayLike | None = None,
         intensities: ArrayLike | None = None,
         kept: Mask | None = None,
+        sweep_s: float = 0.0,
     ) -> None:
         """`points`: array-like with at least 3 columns; the first 3 are used. The others may be array-like, too.
 
         Raises SegslamError for another shape, for a stamp or number that is no integer, for labels, times or
-        intensities that are not one for each point, and for times that are not from 0 to 1.
+        intensities that are not one for each point, for times that are not from 0 to 1, and a negative duration.
         """
         xyz = as_points(points)
         if not isinstance(stamp_ns, int | np.integer):
@@ -206,10 +209,12 @@ class Scan(Record):
             raise SegslamError(f"times: {times.size} times for {len(xyz)} points; give one for each, or none")
         if times.dtype.kind not in "biuf" or not ((times >= 0) & (times <= 1)).all():
             raise SegslamError("times: not all are numbers from 0, the start of the sweep, to 1, its end; or give none")
+        if not 0.0 <= sweep_s < np.inf:
+            raise SegslamError(f"sweep_s {sweep_s!r}: give the duration of a sweep in seconds, or 0 if it is unknown")
         intensities = None if intensities is None else np.asarray(intensities)
         if intensities is not None and (intensities.shape != (len(xyz),) or intensities.dtype.kind not in "biuf"):
             raise SegslamError(f"intensities: {intensities.size} for {len(xyz)} points; give one number for each")
-        values = (xyz, stamp_ns, index, labels, times, intensities, kept)
+        values = (xyz, stamp_ns, index, labels, times, intensities, kept, sweep_s)
         for one, value in zip(fields(self), values, strict=True):
             object.__setattr__(self, one.name, value)
 

@@ -7,8 +7,9 @@ are explained or has a good score, no motion and poses all around, and by place 
 kept; where several explain the scan nearly as well, that is the one with the usual motion. At the start, after a
 repair, and while its poses differ from the last registrations by more than these are unsure, every scan is registered.
 After a repair the odometry continues from the local map; smaller corrections leave it undisturbed. They are added to
-its following poses while every scan is registered; else they are taken as errors that it corrects itself. A scan with
-too few points to show its motion moves on as the last ones did.
+its following poses while every scan is registered; else they are taken as errors that it corrects itself. Points with
+times are moved to the end of their sweep by the motion that the pose shows, and the scan is registered again. A scan
+with too few points to show its motion moves on as the last ones did.
 """
 
 import math
@@ -24,7 +25,7 @@ from scipy.special import chdtri
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.probabilities import INLIER_PROBABILITY, SIGNIFICANT
-from segslam.core.types import BadScan, Information, Motion, MotionState, Scan, Transform
+from segslam.core.types import Information, Motion, MotionState, Scan, Transform
 from segslam.graph.edges import BREAK_M
 from segslam.graph.noise import odometry_information
 from segslam.odometry.likelihood import LEAST_SIGMA_VOXELS, Fit
@@ -32,7 +33,7 @@ from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel
 from segslam.odometry.search import PoseSearch, Recover
 from segslam.odometry.sweep import Foreseeing, Odometry, OdometryResult, swept_by
-from segslam.odometry.sweep_motion import SweepMotion, at_end, at_middle
+from segslam.odometry.sweep_motion import SweepMotion, at_middle
 from segslam.registration.refinement import SHARED_NOISE
 
 ELSEWHERE_M = 30.0
@@ -45,6 +46,10 @@ MOST_OFF_TOGETHER = float(chdtri(6 * WINDOW, SIGNIFICANT))
 MOST_UNCHECKED = 2
 """Chosen: number of scans after which a sensor that seems to stand still is checked: it may have begun to turn. Turns
 of 15 degrees a scan are then within the reach of the search."""
+
+NUM_SWEPT = 2
+"""Chosen: a registration shows the motion during its sweep, by which the points are moved and registered again, twice:
+if once, the most shaken sensors are lost; the more often, the more noise where scans show a motion badly."""
 
 
 class Proposed(NamedTuple):
@@ -98,50 +103,27 @@ class CheckedOdometry:
         `ahead`: the scan to be registered after it, if it is known.
         """
         gap = max(gap, self._intervals.gap(scan.stamp_ns))
+        scan = self._intervals.spanned(scan)
         result = self._inner.register(scan, gap=gap)
         self._intervals.note(scan.stamp_ns)
         if ahead is not None and ahead.stamp_ns > scan.stamp_ns and isinstance(self._inner, Foreseeing):
-            self._inner.foresee(ahead, gap=self._intervals.gap(ahead.stamp_ns))
+            self._inner.foresee(self._intervals.spanned(ahead), gap=self._intervals.gap(ahead.stamp_ns))
         if not self._config.health.check:
             return result
         is_watched = self._is_watched
         T_odom_predicted = self._T_odom_last @ self._motion.predicted(gap)
         seen = SeenScan(result.points, self._config.refine)
         proposed = Proposed(scan, result, seen, self._T_odom_inner @ result.T_odom_lidar, T_odom_predicted, gap)
-        if not self._is_sudden(proposed) and (swept := self._swept(proposed, proposed.T_odom_lidar)):
-            proposed, _ = swept
         checked = self._checked(proposed)
         assert checked.motion
         T_odom_lidar, state = checked.T_odom_lidar, checked.motion.state
         if checked.T_sweep is not None:
-            T_odom_middle = at_middle(scan, T_odom_lidar, checked.T_sweep)
-            self._sweeps.note(T_odom_middle, gap, is_break=state is MotionState.BROKEN)
+            is_break = state is MotionState.BROKEN
+            self._sweeps.note(at_middle(scan, T_odom_lidar, checked.T_sweep), gap, is_break=is_break)
         self._T_odom_last = T_odom_lidar
         if is_watched and state is MotionState.REFINED:
-            T_inner_lidar = at_end(scan, result.T_odom_lidar, result.T_sweep, checked.T_sweep)
-            self._T_odom_inner = geometry.nearest_transform(T_odom_lidar @ geometry.inverse(T_inner_lidar))
+            self._T_odom_inner = geometry.nearest_transform(T_odom_lidar @ geometry.inverse(result.T_odom_lidar))
         return checked
-
-    def _swept(self, proposed: Proposed, T_odom_lidar: Transform) -> tuple[Proposed, Transform] | None:
-        """With the points moved by the motion during the sweep that a pose shows, and this pose then.
-
-        None if they have no times, or hardly differ.
-        """
-        raw, before = proposed.raw, proposed.result.T_sweep
-        if before is None:
-            return None
-        T_sweep = self._sweeps.motion(at_middle(raw, T_odom_lidar, before), proposed.gap)
-        if T_sweep is None:
-            return None
-        if geometry.displacement_m(proposed.scan.moments, before, T_sweep) < LEAST_SIGMA_VOXELS * self._map.voxel_m:
-            return None
-        try:
-            result = swept_by(raw, proposed.result, T_sweep, self._config.odometry)
-        except BadScan:  # no point is within range then
-            return None
-        scan = SeenScan(result.points, self._config.refine)
-        T_odom_proposed, T_odom_end = (at_end(raw, T, before, T_sweep) for T in (proposed.T_odom_lidar, T_odom_lidar))
-        return proposed._replace(result=result, scan=scan, T_odom_lidar=T_odom_proposed), T_odom_end
 
     @property
     def _is_watched(self) -> bool:
@@ -174,12 +156,8 @@ class CheckedOdometry:
         if proposed.scan.is_small:
             return True
         moved_m = geometry.displacement_m(proposed.scan.moments, proposed.T_odom_lidar, self._map.T_odom_map)
-        return moved_m >= self._config.keyframes.distance_m or self._is_sudden(proposed)
-
-    def _is_sudden(self, proposed: Proposed) -> bool:
-        """True if the motion is unlike the last one."""
         sudden_m = geometry.displacement_m(proposed.scan.moments, proposed.T_odom_lidar, proposed.T_odom_predicted)
-        return sudden_m >= self._map.voxel_m
+        return moved_m >= self._config.keyframes.distance_m or sudden_m >= self._map.voxel_m
 
     def _confirmed(self, proposed: Proposed) -> OdometryResult | None:
         """The proposed pose, if a few steps to the last checked scan leave it and fit as usual; else None."""
@@ -209,7 +187,7 @@ class CheckedOdometry:
         search, fits = self._poses(proposed)
         is_rejoined = self._map is not before
         if not is_rejoined:
-            proposed, search, fits = self._sharpened(proposed, search, fits)
+            proposed, search, fits = self._swept(proposed, search, fits)
         scan = proposed.scan
         T_odom_map, T_map_proposed = self._map.T_odom_map, self._map.pose_of(proposed.T_odom_lidar)
         by_chance = 0.0
@@ -297,15 +275,25 @@ class CheckedOdometry:
 
         return PoseSearch(self._map, proposed.scan, prior=prior)
 
-    def _sharpened(
-        self, proposed: Proposed, search: PoseSearch, fits: list[Fit]
-    ) -> tuple[Proposed, PoseSearch, list[Fit]]:
-        """The same with the points moved by the motion that was found, as often as this explains the scan better."""
-        while fits and (swept := self._swept(proposed, self._map.T_odom_map @ fits[0].T_map_lidar)):
-            moved, T_odom_start = swept
+    def _swept(self, proposed: Proposed, search: PoseSearch, fits: list[Fit]) -> tuple[Proposed, PoseSearch, list[Fit]]:
+        """The same with the points moved by the motion during the sweep that the most likely pose shows.
+
+        They stay if they have no times, or hardly differ.
+        """
+        for _ in range(NUM_SWEPT):
+            T_before = proposed.result.T_sweep
+            if T_before is None or not fits:
+                break
+            T_odom_middle = at_middle(proposed.raw, self._map.T_odom_map @ fits[0].T_map_lidar, T_before)
+            T_sweep = self._sweeps.motion(T_odom_middle, proposed.gap)
+            least_m = LEAST_SIGMA_VOXELS * self._map.voxel_m
+            if T_sweep is None or geometry.displacement_m(proposed.scan.moments, T_before, T_sweep) < least_m:
+                break
+            result = swept_by(proposed.raw, proposed.result, T_sweep, self._config.odometry)
+            moved = proposed._replace(result=result, scan=SeenScan(result.points, self._config.refine))
             again = self._search(moved)
-            found = again.near([self._map.pose_of(T_odom_start)], fits[1:])
-            if not found or found[0].mean_log <= fits[0].mean_log:
+            found = again.near([fit.T_map_lidar for fit in fits])
+            if not found:
                 break
             proposed, search, fits = moved, again, found
         return proposed, search, fits

@@ -9,6 +9,7 @@ the change is large.
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from statistics import median
 
 import numpy as np
@@ -16,7 +17,7 @@ from scipy.linalg import eigh
 
 from segslam.core import geometry
 from segslam.core.probabilities import log_chance
-from segslam.core.types import Information, Motion, Transform, Vector
+from segslam.core.types import Information, Motion, Scan, Transform, Vector
 from segslam.odometry.local_map import MAP_SCANS
 
 WINDOW = 30
@@ -50,6 +51,17 @@ class Intervals:
             return 1.0
         gap = interval_s / self.usual_s
         return gap if gap > LONG_GAP else 1.0
+
+    def spanned(self, scan: Scan) -> Scan:
+        """The scan with times of which 0 and 1 are a usual interval apart: the sweep is shorter if scans are left out.
+
+        The odometry takes the motion from scan to scan as that from 0 to 1. An interval up to `LONG_GAP` sweeps is one.
+        """
+        since_last_s = 0.0 if self.last_ns is None else (scan.stamp_ns - self.last_ns) * 1e-9
+        usual_s = self.usual_s or since_last_s
+        if scan.sweep_s <= 0.0 or usual_s <= LONG_GAP * scan.sweep_s:
+            return scan
+        return replace(scan, times=1.0 - scan.sweep_s / usual_s * (1.0 - scan.times), sweep_s=usual_s)
 
     def note(self, stamp_ns: int) -> None:
         """Note the stamp of a scan."""

@@ -68,14 +68,3 @@ def _steady_share(changes: Sequence[Tangent]) -> Tangent:
 def at_middle(scan: Scan, T_odom_lidar: Transform, T_sweep: Transform) -> Transform:
     """The pose at the middle of a sweep, from that at its end, to which its points are moved by `T_sweep`."""
     return T_odom_lidar @ geometry.scaled(T_sweep, float(np.mean(scan.times)) - 1.0)
-
-
-def at_end(scan: Scan, T_odom_lidar: Transform, before: Transform | None, T_sweep: Transform | None) -> Transform:
-    """The pose at the end of a sweep whose points are moved by `T_sweep` now, from that when they were by `before`.
-
-    It stays the same if they are not moved.
-    """
-    if before is None or T_sweep is None or before is T_sweep:
-        return T_odom_lidar
-    T_odom_middle = at_middle(scan, T_odom_lidar, before)
-    return geometry.nearest_transform(T_odom_middle @ geometry.inverse(at_middle(scan, np.eye(4), T_sweep)))

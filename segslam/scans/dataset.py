@@ -162,9 +162,9 @@ def make_scan(
     if not kept.any():
         what = "has no points" if len(points) == 0 else f"none of its {len(points)} points is finite and not 0, 0, 0"
         raise BadScan(f"{source}: {what}; copy the file again, or leave this scan out")
-    times, intensities = np.empty(0), cloud.intensities if has_intensities else None
+    times, sweep_s, intensities = np.empty(0), 0.0, cloud.intensities if has_intensities else None
     if len(cloud.times) == len(points):
-        times = sweep_times(cloud.times[kept], int(kept.sum()), (cloud.stamp_ns or stamp_ns) * 1e-9)
+        times, sweep_s = sweep_times(cloud.times[kept], int(kept.sum()), (cloud.stamp_ns or stamp_ns) * 1e-9)
     if not kept.all():
         points, labels = points[kept], of_rows(labels, kept)
         intensities = None if intensities is None else intensities[kept]
@@ -178,6 +178,7 @@ def make_scan(
         times,
         intensities,
         None if kept.all() else kept,
+        sweep_s,
     )
 
 

@@ -3,10 +3,12 @@
 All parsers raise ValueError with what is wrong.
 """
 
+import math
 import os
 import stat
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from statistics import median
 from typing import NamedTuple
 
 import numpy as np
@@ -143,26 +145,27 @@ def by_name(columns: Iterable[tuple[str, np.ndarray]]) -> Columns:
     return named
 
 
-def sweep_times(times: np.ndarray, num_points: int, stamp_s: float) -> Vector:
-    """Time (n,) of each point: 0 at the start of the sweep, 1 at its end.
+def sweep_times(times: np.ndarray, num_points: int, stamp_s: float) -> tuple[Vector, float]:
+    """Time (n,) of each point, 0 at the start of the sweep and 1 at its end, and its duration (s), 0 if unknown.
 
     `times` (n,) may count from the start of the sweep, up to its end (negative), or absolutely with the start
     `stamp_s`; or they are fractions already. They are divided by the period of the sensor if a usual one fits, so
-    that a sweep without returns at its start or end is not stretched; otherwise by their span. Empty if times are
-    missing, not finite, all equal, or not one per point.
+    that a sweep without returns at its start or end is not stretched; otherwise by their span. Their unit is that in
+    which they span a time most like a usual period. Empty if times are missing, not finite, all equal, or not one per
+    point.
     """
     if len(times) != num_points or num_points == 0 or not np.isfinite(times).all():
-        return np.empty(0)
+        return np.empty(0), 0.0
     first, last = float(times.min()), float(times.max())
     if not 0.0 < last - first < np.inf:
-        return np.empty(0)
+        return np.empty(0), 0.0
     if first >= 0.0 and last <= 1.0 and last - first >= LEAST_SHARE:
-        return times
-    for unit_s in UNITS_S:
-        for period in (period_s / unit_s for period_s in PERIODS_S):
-            if not (1.0 - LONGEST_SEAM) * period <= last - first <= (1.0 + JITTER) * period:
-                continue
-            for start in (0.0, -period, stamp_s / unit_s):
-                if start - JITTER * period <= first and last <= start + (1.0 + JITTER) * period:
-                    return np.clip((times - start) / period, 0.0, 1.0)
-    return (times - first) / (last - first)
+        return times, 0.0
+    unit_s = min(UNITS_S, key=lambda unit_s: abs(math.log(last - first) - math.log(median(PERIODS_S) / unit_s)))
+    for period in (period_s / unit_s for period_s in PERIODS_S):
+        if not (1.0 - LONGEST_SEAM) * period <= last - first <= (1.0 + JITTER) * period:
+            continue
+        for start in (0.0, -period, stamp_s / unit_s):
+            if start - JITTER * period <= first and last <= start + (1.0 + JITTER) * period:
+                return np.clip((times - start) / period, 0.0, 1.0), period * unit_s
+    return (times - first) / (last - first), unit_s * (last - first)

@@ -18,21 +18,27 @@ def test_a_sweep_without_returns_at_its_seam_is_not_stretched(unit_s: float, per
     stamp_s = 1.7e9
     start_s = {"start": 0.0, "end": -period_s, "absolute": stamp_s}[origin]
     times = (start_s + SHARES * period_s) / unit_s
-    np.testing.assert_allclose(sweep_times(times, 7, stamp_s), SHARES, atol=1e-5)  # 1.7e9 s to 0.24 microseconds
+    found, sweep_s = sweep_times(times, 7, stamp_s)
+    np.testing.assert_allclose(found, SHARES, atol=1e-5)  # 1.7e9 s to 0.24 microseconds
+    assert sweep_s == pytest.approx(period_s)
 
 
 def test_shares_of_a_sweep_stay_as_they_are() -> None:
-    np.testing.assert_array_equal(sweep_times(SHARES, 7, 0.0), SHARES)
+    found, sweep_s = sweep_times(SHARES, 7, 0.0)
+    np.testing.assert_array_equal(found, SHARES)
+    assert sweep_s == 0.0
 
 
 def test_times_that_fit_no_period_are_scaled_by_the_first_and_last_point() -> None:
-    for times in (np.array([10.0, 20.0, 15.0]), np.array([0.0, 0.0664, 0.0332])):  # 15 Hz
-        np.testing.assert_allclose(sweep_times(times, 3, 0.0), [0.0, 1.0, 0.5])
+    for times, expected_s in ((np.array([10.0, 20.0, 15.0]), 0.01), (np.array([0.0, 66.4, 33.2]), 0.0664)):  # 15 Hz
+        found, sweep_s = sweep_times(times, 3, 0.0)
+        np.testing.assert_allclose(found, [0.0, 1.0, 0.5])
+        assert sweep_s == pytest.approx(expected_s)
 
 
 def test_a_full_sweep_begins_at_0_and_ends_within_the_period() -> None:
     times = np.linspace(0.0, 0.1008, 11)  # the sensor turns a little slower than it should
-    shares = sweep_times(times, 11, 0.0)
+    shares, _ = sweep_times(times, 11, 0.0)
     assert shares[0] == 0.0
     assert shares[-1] == 1.0
 
@@ -42,7 +48,7 @@ def test_a_full_sweep_begins_at_0_and_ends_within_the_period() -> None:
     [([], 3), ([0.0, 0.1], 3), ([0.05, 0.05, 0.05], 3), ([0.0, np.nan, 0.1], 3), ([], 0)],
 )
 def test_missing_times_give_none(times: list[float], num_points: int) -> None:
-    assert len(sweep_times(np.array(times), num_points, 0.0)) == 0
+    assert len(sweep_times(np.array(times), num_points, 0.0)[0]) == 0
 
 
 @pytest.mark.parametrize("invalid", [0.0, np.nan, -1e30])
@@ -54,6 +60,7 @@ def test_times_of_points_without_return_do_not_matter(invalid: float) -> None:
     labels = np.zeros(8, np.uint8)
     expected = make_scan(Path("0.bin"), 0, round(1e9 * stamp_s), Cloud(points, times), labels).times
     times[[2, 5]] = invalid
-    found = make_scan(Path("0.bin"), 0, round(1e9 * stamp_s), Cloud(points, times), labels).times
-    np.testing.assert_array_equal(found, expected)
-    np.testing.assert_allclose(found, np.linspace(0.0, 0.999, 8)[[0, 1, 3, 4, 6, 7]], atol=1e-5)
+    found = make_scan(Path("0.bin"), 0, round(1e9 * stamp_s), Cloud(points, times), labels)
+    np.testing.assert_array_equal(found.times, expected)
+    np.testing.assert_allclose(found.times, np.linspace(0.0, 0.999, 8)[[0, 1, 3, 4, 6, 7]], atol=1e-5)
+    assert found.sweep_s == pytest.approx(0.1)

@@ -223,6 +223,7 @@ WRONG_KINDS = {
     "segslam.Scan(np.ones((2, 3)), 0, times=[0, np.nan])": "times: not all are numbers from 0",
     "segslam.Scan(np.ones((2, 3)), 0, times=[0, 1e8])": "times: not all are numbers from 0",
     "segslam.Scan(np.ones((2, 3)), 0, times=[0, 1], sweep_s=-0.1)": "sweep_s -0.1: give the duration of a sweep",
+    "segslam.Scan(np.ones((2, 3)), 0, times=[0, 1], stamp_time=2.0)": "stamp_time 2.0: give 0 for the start",
     "segslam.Scan(np.ones((2, 3)), 0, times=np.zeros((2, 1, 2)))": "4 times for 2 points",
     "segslam.Scan(np.ones((5, 3)), 0, 2.5)": "index 2.5: give an integer, or None",
     "segslam.Scan(np.ones((5, 3)), 0, labels=np.ones(2, np.uint8))": "2 labels for 5 points",

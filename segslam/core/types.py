@@ -180,6 +180,8 @@ class Scan(Record):
     """Rows of the file that the points were read from; None for all rows."""
     sweep_s: float
     """Duration from 0 to 1 of the times (s); 0 if unknown: the time between two scans."""
+    stamp_time: float
+    """When the sensor was at the pose of the scan, that is at its stamp, as a time like those of the points."""
 
     def __init__(
         self,
@@ -191,11 +193,12 @@ class Scan(Record):
         intensities: ArrayLike | None = None,
         kept: Mask | None = None,
         sweep_s: float = 0.0,
+        stamp_time: float = 1.0,
     ) -> None:
         """`points`: array-like with at least 3 columns; the first 3 are used. The others may be array-like, too.
 
         Raises SegslamError for another shape, for a stamp or number that is no integer, for labels, times or
-        intensities that are not one for each point, for times that are not from 0 to 1, and a negative duration.
+        intensities that are not one for each point, for times that are not from 0 to 1, and for a negative duration.
         """
         xyz = as_points(points)
         if not isinstance(stamp_ns, int | np.integer):
@@ -211,10 +214,12 @@ class Scan(Record):
             raise SegslamError("times: not all are numbers from 0, the start of the sweep, to 1, its end; or give none")
         if not 0.0 <= sweep_s < np.inf:
             raise SegslamError(f"sweep_s {sweep_s!r}: give the duration of a sweep in seconds, or 0 if it is unknown")
+        if not 0.0 <= stamp_time <= 1.0:
+            raise SegslamError(f"stamp_time {stamp_time!r}: give 0 for the start of the sweep, to 1 for its end")
         intensities = None if intensities is None else np.asarray(intensities)
         if intensities is not None and (intensities.shape != (len(xyz),) or intensities.dtype.kind not in "biuf"):
             raise SegslamError(f"intensities: {intensities.size} for {len(xyz)} points; give one number for each")
-        values = (xyz, stamp_ns, index, labels, times, intensities, kept, sweep_s)
+        values = (xyz, stamp_ns, index, labels, times, intensities, kept, sweep_s, stamp_time)
         for one, value in zip(fields(self), values, strict=True):
             object.__setattr__(self, one.name, value)
 

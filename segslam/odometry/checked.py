@@ -32,7 +32,7 @@ from segslam.odometry.likelihood import LEAST_SIGMA_VOXELS, Fit
 from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel
 from segslam.odometry.search import PoseSearch, Recover
-from segslam.odometry.sweep import Foreseeing, Odometry, OdometryResult, swept_by
+from segslam.odometry.sweep import Foreseeing, Odometry, OdometryResult, at_stamp, swept_by
 from segslam.odometry.sweep_motion import SweepMotion, at_middle
 from segslam.registration.refinement import SHARED_NOISE
 
@@ -109,7 +109,7 @@ class CheckedOdometry:
         if ahead is not None and ahead.stamp_ns > scan.stamp_ns and isinstance(self._inner, Foreseeing):
             self._inner.foresee(self._intervals.spanned(ahead), gap=self._intervals.gap(ahead.stamp_ns))
         if not self._config.health.check:
-            return result
+            return at_stamp(scan, result)
         is_watched = self._is_watched
         T_odom_predicted = self._T_odom_last @ self._motion.predicted(gap)
         seen = SeenScan(result.points, self._config.refine)
@@ -123,7 +123,7 @@ class CheckedOdometry:
         self._T_odom_last = T_odom_lidar
         if is_watched and state is MotionState.REFINED:
             self._T_odom_inner = geometry.nearest_transform(T_odom_lidar @ geometry.inverse(result.T_odom_lidar))
-        return checked
+        return at_stamp(scan, checked)
 
     @property
     def _is_watched(self) -> bool:

@@ -61,7 +61,9 @@ class Intervals:
         usual_s = self.usual_s or since_last_s
         if scan.sweep_s <= 0.0 or usual_s <= LONG_GAP * scan.sweep_s:
             return scan
-        return replace(scan, times=1.0 - scan.sweep_s / usual_s * (1.0 - scan.times), sweep_s=usual_s)
+        share = scan.sweep_s / usual_s
+        stamp_time = 1.0 - share * (1.0 - scan.stamp_time)
+        return replace(scan, times=1.0 - share * (1.0 - scan.times), stamp_time=stamp_time, sweep_s=usual_s)
 
     def note(self, stamp_ns: int) -> None:
         """Note the stamp of a scan."""

@@ -26,7 +26,7 @@ class OdometryResult:
     T_odom_lidar: Transform
     """Odom is the frame of the LiDAR at the first scan, so the first pose is the identity."""
     points: Points
-    """(n, 3) float32 in the LiDAR frame at the end of the sweep; in range; motion-compensated if times are known."""
+    """(n, 3) float32 in the LiDAR frame at this pose; in range; motion-compensated if times are known."""
     labels: ScanLabels
     """(n,) labels, or a function that computes them."""
     intensities: Vector | None = None
@@ -97,6 +97,16 @@ def swept_by(scan: Scan, result: OdometryResult, T_sweep: Transform, config: Odo
     return replace(result, points=points.astype(np.float32), labels=labels, intensities=intensities, T_sweep=T_sweep)
 
 
+def at_stamp(scan: Scan, result: OdometryResult) -> OdometryResult:
+    """The result with the pose of the sensor at the stamp of the scan, instead of the end of its sweep."""
+    if result.T_sweep is None or scan.stamp_time == 1.0:
+        return result
+    T_stamp_end = geometry.scaled(result.T_sweep, 1.0 - scan.stamp_time)
+    T_odom_stamp = geometry.nearest_transform(result.T_odom_lidar @ geometry.inverse(T_stamp_end))
+    points = geometry.apply(T_stamp_end, result.points.astype(np.float64)).astype(np.float32)
+    return replace(result, T_odom_lidar=T_odom_stamp, points=points)
+
+
 def is_swept(scan: Scan, config: OdometryConfig) -> bool:
     """True if the points of a scan are moved to the end of its sweep."""
     return config.deskew and len(scan.times) > 0 and bool(np.ptp(scan.times) > 0)
@@ -142,7 +152,9 @@ class GivenOdometry:
         T_sweep = geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_lidar, 1 / gap)
         points, labels, intensities = deskew_scan(scan, T_sweep, self._config)
         self._T_odom_given, self._T_odom_last, self._T_given_last = T_odom_given, T_odom_lidar, T_given_lidar
-        return OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities)
+        moved = T_sweep if is_swept(scan, self._config) else None
+        end = OdometryResult(T_odom_lidar, points.astype(np.float32), labels, intensities, T_sweep=moved)
+        return replace(at_stamp(scan, end), T_odom_lidar=T_odom_lidar, T_sweep=None)
 
     def follow(self, scans: PosedScans, T_odom_lidar: Transform, T_before_lidar: Transform) -> None:
         """Continue from another pose of the last scan."""

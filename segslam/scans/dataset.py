@@ -16,7 +16,7 @@ from segslam.core.types import BadScan, Indices, Points, Scan, ScanLabels, Segsl
 from segslam.core.whole_files import expanded, read_text
 from segslam.labels.encodings import ENCODINGS, Encoding
 from segslam.labels.label_files import LabelSource, of_rows
-from segslam.scans.scan_files import sweep_times
+from segslam.scans.scan_files import sweep_of
 
 logger = logging.getLogger(__name__)
 
@@ -35,6 +35,8 @@ class Cloud:
     """(n,) in the sensor's unit; None if there are none."""
     stamp_ns: int | None = None
     """None if the scan itself has no stamp."""
+    logged_ns: int | None = None
+    """When it was recorded, if it has no stamp."""
 
 
 class Dataset:
@@ -162,9 +164,10 @@ def make_scan(
     if not kept.any():
         what = "has no points" if len(points) == 0 else f"none of its {len(points)} points is finite and not 0, 0, 0"
         raise BadScan(f"{source}: {what}; copy the file again, or leave this scan out")
-    times, sweep_s, intensities = np.empty(0), 0.0, cloud.intensities if has_intensities else None
-    if len(cloud.times) == len(points):
-        times, sweep_s = sweep_times(cloud.times[kept], int(kept.sum()), (cloud.stamp_ns or stamp_ns) * 1e-9)
+    intensities = cloud.intensities if has_intensities else None
+    measured = cloud.times[kept] if len(cloud.times) == len(points) else np.empty(0)
+    stamp_s = (cloud.stamp_ns or stamp_ns) * 1e-9
+    sweep = sweep_of(measured, int(kept.sum()), stamp_s, counts_from_stamp=bool(cloud.stamp_ns))
     if not kept.all():
         points, labels = points[kept], of_rows(labels, kept)
         intensities = None if intensities is None else intensities[kept]
@@ -175,10 +178,11 @@ def make_scan(
         stamp_ns,
         index,
         labels,
-        times,
+        sweep.times,
         intensities,
         None if kept.all() else kept,
-        sweep_s,
+        sweep.duration_s,
+        sweep.stamp_time,
     )
 
 

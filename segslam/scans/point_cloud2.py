@@ -37,7 +37,7 @@ class MessageClouds:
         """Raises what the reader raises for a damaged message."""
         log_ns, message = self._messages[index]
         cloud = read_message(message)
-        return cloud if self._has_stamps else replace(cloud, stamp_ns=log_ns)
+        return cloud if self._has_stamps else replace(cloud, stamp_ns=None, logged_ns=log_ns)
 
 
 def read_message(message: Any) -> Cloud:

@@ -81,12 +81,13 @@ class Recording(Dataset):
             points = points if points.dtype == np.float32 else points.astype(np.float64)
             fits = item.intensities is not None and len(item.intensities) == len(points)
             times = np.asarray(item.times, dtype=np.float64).ravel()
-            cloud = Cloud(points, times, item.intensities if fits else None, item.stamp_ns)
+            cloud = replace(item, points=points, times=times, intensities=item.intensities if fits else None)
         except BadScan:
             raise
         except FOREIGN_ERRORS as error:
             raise BadScan(f"{file}: the scan cannot be read ({_reason(error)})") from error
-        stamp_ns = int(self._stamps[index]) if cloud.stamp_ns is None else cloud.stamp_ns
+        stamps_ns = (cloud.stamp_ns, cloud.logged_ns, int(self._stamps[index]))
+        stamp_ns = next(stamp for stamp in stamps_ns if stamp is not None)
         if abs(stamp_ns) >= 2**63:
             raise BadScan(f"{file}: its stamp {stamp_ns} ns is more than 292 years; correct the sensor's clock")
         return file, stamp_ns, cloud

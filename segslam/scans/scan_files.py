@@ -145,27 +145,46 @@ def by_name(columns: Iterable[tuple[str, np.ndarray]]) -> Columns:
     return named
 
 
-def sweep_times(times: np.ndarray, num_points: int, stamp_s: float) -> tuple[Vector, float]:
-    """Time (n,) of each point, 0 at the start of the sweep and 1 at its end, and its duration (s), 0 if unknown.
+class Sweep(NamedTuple):
+    """When the points of a scan were measured."""
 
-    `times` (n,) may count from the start of the sweep, up to its end (negative), or absolutely with the start
-    `stamp_s`; or they are fractions already. They are divided by the period of the sensor if a usual one fits, so
-    that a sweep without returns at its start or end is not stretched; otherwise by their span. Their unit is that in
-    which they span a time most like a usual period. Empty if times are missing, not finite, all equal, or not one per
-    point.
+    times: Vector
+    """(n,) 0 at the start of the sweep to 1 at its end; empty if unknown."""
+    duration_s: float
+    """From 0 to 1; 0 if unknown."""
+    stamp_time: float
+    """That of the stamp; 1 if unknown."""
+
+
+def sweep_of(times: np.ndarray, num_points: int, stamp_s: float, *, counts_from_stamp: bool) -> Sweep:
+    """The sweep of a scan, from the times of its points.
+
+    `times` (n,) may count from the start of the sweep, up to its end (negative), or absolutely with the stamp `stamp_s`
+    at its start or end; or they are fractions already. They are divided by the period of the sensor if a usual one
+    fits, so that a sweep without returns at its start or end is not stretched; otherwise by their span. Their unit is
+    that in which they span a time most like a usual period. There are none if times are missing, not finite, all equal,
+    or not one per point. `counts_from_stamp`: times near 0 count from the stamp, as in messages with a header.
     """
     if len(times) != num_points or num_points == 0 or not np.isfinite(times).all():
-        return np.empty(0), 0.0
+        return Sweep(np.empty(0), 0.0, 1.0)
     first, last = float(times.min()), float(times.max())
-    if not 0.0 < last - first < np.inf:
-        return np.empty(0), 0.0
-    if first >= 0.0 and last <= 1.0 and last - first >= LEAST_SHARE:
-        return times, 0.0
-    unit_s = min(UNITS_S, key=lambda unit_s: abs(math.log(last - first) - math.log(median(PERIODS_S) / unit_s)))
+    span = last - first
+    if not 0.0 < span < np.inf:
+        return Sweep(np.empty(0), 0.0, 1.0)
+    if first >= 0.0 and last <= 1.0 and span >= LEAST_SHARE:
+        return Sweep(times, 0.0, 1.0)
+    unit_s = min(UNITS_S, key=lambda unit_s: abs(math.log(span) - math.log(median(PERIODS_S) / unit_s)))
+    start, duration = first, span
     for period in (period_s / unit_s for period_s in PERIODS_S):
-        if not (1.0 - LONGEST_SEAM) * period <= last - first <= (1.0 + JITTER) * period:
-            continue
-        for start in (0.0, -period, stamp_s / unit_s):
-            if start - JITTER * period <= first and last <= start + (1.0 + JITTER) * period:
-                return np.clip((times - start) / period, 0.0, 1.0), period * unit_s
-    return (times - first) / (last - first), unit_s * (last - first)
+        if (1.0 - LONGEST_SEAM) * period <= span <= (1.0 + JITTER) * period:
+            for possible in (0.0, -period, stamp_s / unit_s, stamp_s / unit_s - period):
+                if possible - JITTER * period <= first and last <= possible + (1.0 + JITTER) * period:
+                    start, duration = possible, period
+                    break
+    is_absolute = min(abs(first), abs(last)) > duration
+    stamp = stamp_s / unit_s if is_absolute else 0.0 if counts_from_stamp else math.inf
+    stamp_time = (stamp - start) / duration
+    if not -JITTER <= stamp_time <= 1.0 + JITTER:
+        stamp_time = 1.0
+    times = np.clip((times - start) / duration, 0.0, 1.0)
+    return Sweep(times, duration * unit_s, min(max(stamp_time, 0.0), 1.0))

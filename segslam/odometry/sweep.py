@@ -134,11 +134,11 @@ class GivenOdometry:
     def __init__(
         self, trajectory: Trajectory, config: OdometryConfig, *, match: Literal["scan_index", "stamp"] = "scan_index"
     ) -> None:
-        """`match`: find the row of a scan by its number, or by the nearest stamp within `STAMP_TOLERANCE_S`."""
+        """`match`: the pose of a scan is that with its number, or at its stamp (within `STAMP_TOLERANCE_S`)."""
         self._config = config
         self._trajectory = trajectory
         self._rows = {int(scan_index): row for row, scan_index in enumerate(trajectory.scan_index)}
-        self._row = self._row_of_scan if match == "scan_index" else self._row_of_stamp
+        self._pose = self._pose_of_scan if match == "scan_index" else self._pose_at_stamp
         self._T_odom_given: Transform | None = None
         """Transform from the frame of the trajectory to the odometry's frame."""
         self._T_given_last = np.eye(4)
@@ -146,7 +146,7 @@ class GivenOdometry:
 
     def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
         """The pose and the cropped points of a scan. Raises BadScan if it has no pose, or no point within range."""
-        T_given_lidar = self._trajectory.T_world_lidar[self._row(scan)]
+        T_given_lidar = self._pose(scan)
         T_odom_given = geometry.inverse(T_given_lidar) if self._T_odom_given is None else self._T_odom_given
         T_odom_lidar = T_odom_given @ T_given_lidar
         T_sweep = geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_lidar, 1 / gap)
@@ -161,24 +161,32 @@ class GivenOdometry:
         self._T_odom_given = T_odom_lidar @ geometry.inverse(self._T_given_last)
         self._T_odom_last = T_odom_lidar
 
-    def _row_of_scan(self, scan: Scan) -> int:
+    def _pose_of_scan(self, scan: Scan) -> Transform:
         if scan.index not in self._rows:
             raise BadScan(
                 f"scan {scan.index}: the given odometry has no pose for it "
                 f"(it has {_span(self._trajectory.scan_index)}); omit the scan or give a longer trajectory"
             )
-        return self._rows[scan.index]
+        return self._trajectory.T_world_lidar[self._rows[scan.index]]
 
-    def _row_of_stamp(self, scan: Scan) -> int:
-        apart_ns = np.abs(self._trajectory.stamp_ns - scan.stamp_ns)
-        row = int(np.argmin(apart_ns)) if len(apart_ns) else -1
-        if row < 0 or apart_ns[row] > STAMP_TOLERANCE_S * 1e9:
+    def _pose_at_stamp(self, scan: Scan) -> Transform:
+        """Between two poses, if there is one within the tolerance on each side; else the nearest one."""
+        poses, apart_s = self._trajectory.T_world_lidar, (self._trajectory.stamp_ns - scan.stamp_ns) * 1e-9
+        near = np.flatnonzero(np.abs(apart_s) <= STAMP_TOLERANCE_S)
+        if len(near) == 0:
             raise BadScan(
                 f"scan {scan.index}: the given odometry has no pose within {STAMP_TOLERANCE_S} s of its "
                 f"stamp {scan.stamp_ns} ns (it has {_span(self._trajectory.stamp_ns)}); "
                 "omit the scan, or correct the stamps"
             )
-        return row
+        before, after = near[apart_s[near] < 0.0], near[apart_s[near] >= 0.0]
+        if len(before) == 0 or len(after) == 0:
+            return poses[near[np.argmin(np.abs(apart_s[near]))]]
+        last, following = before[np.argmax(apart_s[before])], after[np.argmin(apart_s[after])]
+        if apart_s[following] == 0.0:
+            return poses[following]
+        share = apart_s[last] / (apart_s[last] - apart_s[following])
+        return geometry.interpolate(poses[last], poses[following], share)
 
 
 def _span(values: np.ndarray) -> str:

@@ -264,6 +264,19 @@ def test_a_given_pose_is_found_by_its_stamp() -> None:
     np.testing.assert_allclose(poses, [_forward(0.0), _forward(3.0)])
 
 
+def test_a_scan_between_two_given_poses_has_one_between_them() -> None:
+    stamps_ns = np.arange(0, 100_000_000, 10_000_000)
+    T_world_lidar = np.array([geometry.transform(geometry.yaw(0.1 * k), [0.5 * k, 0.0, 0.0]) for k in range(10)])
+    odometry = GivenOdometry(Trajectory(np.arange(10), stamps_ns, T_world_lidar), CONFIG, match="stamp")
+    points = _room(np.random.default_rng(0), 30)
+    stamps = (0, 10_000_000, 32_500_000, 99_000_000)
+    found = [odometry.register(_scan(points, index=7, stamp_ns=stamp)).T_odom_lidar for stamp in stamps]
+    np.testing.assert_array_equal(found[:2], T_world_lidar[:2])
+    assert geometry.angle(found[2]) == pytest.approx(0.325)
+    np.testing.assert_allclose(found[2][:2, 3], [1.625, 0.0], atol=6e-3)  # beside the chord, on an arc
+    np.testing.assert_allclose(found[3], T_world_lidar[9])
+
+
 @pytest.mark.parametrize("match", ["scan_index", "stamp"])
 def test_a_scan_without_a_given_pose_is_a_bad_scan(match: str) -> None:
     points = _room(np.random.default_rng(0), 30)

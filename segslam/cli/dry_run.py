@@ -36,6 +36,8 @@ def found_in(scans: "Dataset", settings: "Config") -> dict[str, Any]:
             "scan": int(scans.scan_index[first_row]),
             "num_points": len(first.points),
             "has_times": len(first.times) > 0,
+            "sweep_s": first.sweep_s or None,
+            "stamp_time": first.stamp_time if len(first.times) else None,
             "has_intensities": first.intensities is not None,
             "range_m": [float(ranges_m.min()), float(np.median(ranges_m)), float(ranges_m.max())],
             "elevation_deg": [float(value) for value in np.percentile(elevation_deg, (1, 99))],
@@ -59,7 +61,7 @@ def lines(found: dict[str, Any]) -> str:
             f"over {found['seconds']:.1f} s{rate}",
             f"scan {scan['scan']}: {scan['num_points']} points at {nearest:.1f} to {farthest:.1f} m (median "
             f"{middle:.1f} m), elevations {low:.1f} to {high:.1f} degrees; "
-            f"point times: {'yes' if scan['has_times'] else 'none, points are assumed to be motion-compensated'}; "
+            f"point times: {_times(scan)}; "
             f"intensities: {'read' if scan['has_intensities'] else 'not read'}",
             f"labels: {found['labels']}",
             f"ground-truth poses: {truth}",
@@ -69,6 +71,15 @@ def lines(found: dict[str, Any]) -> str:
             "nothing was written",
         ]
     )
+
+
+def _times(scan: dict[str, Any]) -> str:
+    """How the times of the points are understood."""
+    if not scan["has_times"]:
+        return "none, points are assumed to be motion-compensated"
+    if scan["sweep_s"] is None:
+        return "a sweep from scan to scan"
+    return f"a sweep of {scan['sweep_s']:.3f} s, poses at {scan['stamp_time'] * scan['sweep_s']:.3f} s of it"
 
 
 def first_usable(scans: "Dataset", *, backwards: bool = False) -> "tuple[int, Scan]":

@@ -138,7 +138,7 @@ class GivenOdometry:
         self._config = config
         self._trajectory = trajectory
         self._rows = {int(scan_index): row for row, scan_index in enumerate(trajectory.scan_index)}
-        self._pose = self._pose_of_scan if match == "scan_index" else self._pose_at_stamp
+        self._is_by_stamp = match == "stamp"
         self._T_odom_given: Transform | None = None
         """Transform from the frame of the trajectory to the odometry's frame."""
         self._T_given_last = np.eye(4)
@@ -146,10 +146,12 @@ class GivenOdometry:
 
     def register(self, scan: Scan, *, gap: float = 1.0) -> OdometryResult:
         """The pose and the cropped points of a scan. Raises BadScan if it has no pose, or no point within range."""
-        T_given_lidar = self._pose(scan)
+        T_given_lidar = self._pose_at_stamp(scan) if self._is_by_stamp else self._pose_of_scan(scan)
         T_odom_given = geometry.inverse(T_given_lidar) if self._T_odom_given is None else self._T_odom_given
         T_odom_lidar = T_odom_given @ T_given_lidar
-        T_sweep = geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_lidar, 1 / gap)
+        T_sweep = self._motion_during(scan)
+        if T_sweep is None:
+            T_sweep = geometry.scaled(geometry.inverse(self._T_odom_last) @ T_odom_lidar, 1 / gap)
         points, labels, intensities = deskew_scan(scan, T_sweep, self._config)
         self._T_odom_given, self._T_odom_last, self._T_given_last = T_odom_given, T_odom_lidar, T_given_lidar
         moved = T_sweep if is_swept(scan, self._config) else None
@@ -170,15 +172,31 @@ class GivenOdometry:
         return self._trajectory.T_world_lidar[self._rows[scan.index]]
 
     def _pose_at_stamp(self, scan: Scan) -> Transform:
-        """Between two poses, if there is one within the tolerance on each side; else the nearest one."""
-        poses, apart_s = self._trajectory.T_world_lidar, (self._trajectory.stamp_ns - scan.stamp_ns) * 1e-9
-        near = np.flatnonzero(np.abs(apart_s) <= STAMP_TOLERANCE_S)
-        if len(near) == 0:
+        T_given_lidar = self._pose_at(scan.stamp_ns)
+        if T_given_lidar is None:
             raise BadScan(
                 f"scan {scan.index}: the given odometry has no pose within {STAMP_TOLERANCE_S} s of its "
                 f"stamp {scan.stamp_ns} ns (it has {_span(self._trajectory.stamp_ns)}); "
                 "omit the scan, or correct the stamps"
             )
+        return T_given_lidar
+
+    def _motion_during(self, scan: Scan) -> Transform | None:
+        """The motion during the sweep; None if its duration or the poses at its start and end are unknown."""
+        if not self._is_by_stamp or scan.sweep_s == 0.0:
+            return None
+        start_ns = scan.stamp_ns - round(1e9 * scan.sweep_s * scan.stamp_time)
+        T_given_start, T_given_end = self._pose_at(start_ns), self._pose_at(start_ns + round(1e9 * scan.sweep_s))
+        if T_given_start is None or T_given_end is None:
+            return None
+        return geometry.inverse(T_given_start) @ T_given_end
+
+    def _pose_at(self, stamp_ns: int) -> Transform | None:
+        """Between two poses, if there is one within the tolerance on each side; else the nearest one, or None."""
+        poses, apart_s = self._trajectory.T_world_lidar, (self._trajectory.stamp_ns - stamp_ns) * 1e-9
+        near = np.flatnonzero(np.abs(apart_s) <= STAMP_TOLERANCE_S)
+        if len(near) == 0:
+            return None
         before, after = near[apart_s[near] < 0.0], near[apart_s[near] >= 0.0]
         if len(before) == 0 or len(after) == 0:
             return poses[near[np.argmin(np.abs(apart_s[near]))]]

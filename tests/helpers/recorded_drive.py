@@ -94,15 +94,14 @@ def truth(num_scans: int = 30) -> Trajectory:
     return Trajectory(*(getattr(whole, name)[:num_scans] for name in ("scan_index", "stamp_ns", "T_world_lidar")))
 
 
-def write_mcap(file: Path, drive: Drive = (), *, chunk_size: int = 2**20) -> Path:
-    """ROS 2, with a second topic of clouds."""
+def write_mcap(file: Path, drive: Drive = (), *, chunk_size: int = 2**20, has_stamps: bool = True) -> Path:
+    """ROS 2, with a second topic of clouds. Without stamps, only the log has them."""
     with file.open("wb") as stream, McapWriter(stream, chunk_size=chunk_size) as writer:
         schema = writer.register_msgdef(MESSAGE, DEFINITION)
         for stamp_ns, rows in drive or clouds():
             for topic in (TOPIC, OTHER_TOPIC):
-                writer.write_message(
-                    topic, schema, _as_dict(stamp_ns, rows[: None if topic == TOPIC else 10]), stamp_ns
-                )
+                kept = rows[: None if topic == TOPIC else 10]
+                writer.write_message(topic, schema, _as_dict(stamp_ns if has_stamps else 0, kept), stamp_ns)
     return file
 
 

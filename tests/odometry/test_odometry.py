@@ -264,6 +264,21 @@ def test_a_given_pose_is_found_by_its_stamp() -> None:
     np.testing.assert_allclose(poses, [_forward(0.0), _forward(3.0)])
 
 
+@pytest.mark.parametrize("stamp_time", [0.0, 1.0])
+def test_by_given_poses_at_its_start_and_end_the_motion_during_a_sweep_is_known(stamp_time: float) -> None:
+    """The sensor moves by another distance in each sweep, and the last motion is not that during this one."""
+    at_m = np.array([0.0, 1.0, 5.0, 3.0])
+    given = Trajectory(np.arange(4), 10**8 * np.arange(4), np.array([_forward(x) for x in at_m]))
+    odometry = GivenOdometry(given, OdometryConfig(min_range_m=0.0), match="stamp")
+    world, times = np.random.default_rng(0).uniform(-20.0, 20.0, (30, 3)), np.linspace(0.0, 1.0, 30)
+    for sweep in range(3):
+        stamp = sweep + round(stamp_time)
+        moved_m = at_m[sweep] + times * (at_m[sweep + 1] - at_m[sweep])
+        measured = world - np.column_stack([moved_m, np.zeros((30, 2))])
+        scan = Scan(measured, 10**8 * stamp, stamp, times=times, sweep_s=0.1, stamp_time=stamp_time)
+        np.testing.assert_allclose(odometry.register(scan).points, world - [at_m[stamp], 0.0, 0.0], atol=1e-5)
+
+
 def test_a_scan_between_two_given_poses_has_one_between_them() -> None:
     stamps_ns = np.arange(0, 100_000_000, 10_000_000)
     T_world_lidar = np.array([geometry.transform(geometry.yaw(0.1 * k), [0.5 * k, 0.0, 0.0]) for k in range(10)])

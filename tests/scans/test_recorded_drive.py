@@ -44,6 +44,15 @@ def test_a_recording_gives_its_points_with_times_in_step_and_its_stamps(
         np.testing.assert_allclose(scan.times, returned["t"] / SWEEP_NS, atol=1e-12)
 
 
+@pytest.mark.parametrize("has_stamps", [True, False])
+def test_the_stamp_of_a_header_is_at_the_start_of_the_sweep_that_of_a_log_is_not(
+    tmp_path: Path, has_stamps: bool
+) -> None:
+    dataset = open_dataset(write_mcap(tmp_path / "drive.mcap", has_stamps=has_stamps), topic=TOPIC)
+    assert [dataset[row].stamp_ns for row in (0, 3)] == [clouds()[row][0] for row in (0, 3)]
+    assert dataset[3].stamp_time == (0.0 if has_stamps else 1.0)
+
+
 def _ate_m(folder: Path) -> float:
     """Error without the first scans: the recording starts at full speed, and the first sweeps cannot be deskewed."""
     poses = read_poses(folder / "odometry_tum.txt")
@@ -62,6 +71,22 @@ def test_times_of_points_make_the_map_of_a_recording_better(tmp_path: Path) -> N
     assert errors_m[True] < 0.8 * errors_m[False], "the first sweeps, which cannot be corrected, are in both"
     stamps_ns = read_poses(out / "odometry_tum.txt").stamp_ns
     np.testing.assert_allclose(stamps_ns, FIRST_STAMP_NS + SWEEP_NS * np.arange(len(clouds())), rtol=0, atol=1_000)
+
+
+def test_a_dry_run_shows_how_the_times_of_points_are_understood(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The stamp of a recorded cloud is at the start of its sweep; that of a file alone is not known to be."""
+    recording, files = write_mcap(tmp_path / "drive.mcap"), tmp_path / "files"
+    files.mkdir()
+    scan = open_dataset(recording, topic=TOPIC)[0]
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(scan.points))
+    cloud.point["t"] = o3d.core.Tensor((scan.times * SWEEP_NS).astype(np.float64)[:, None])
+    o3d.t.io.write_point_cloud(str(files / "0.pcd"), cloud)
+    for data, expected in ((recording, "poses at 0.000 s of it"), (files, "poses at 0.100 s of it")):
+        topic = ("--topic", TOPIC) if data == recording else ()
+        assert run("map", data, *topic, "--dry-run") == 0
+        assert f"point times: a sweep of 0.100 s, {expected}" in capsys.readouterr().out
 
 
 def test_a_recording_with_several_topics_needs_the_option_topic(

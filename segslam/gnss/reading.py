@@ -55,7 +55,7 @@ def _read_messages(recording: Path, topic: str) -> list[Row]:
 
     read = McapMessages if recording.suffix.lower() == ".mcap" else BagMessages
     try:
-        messages = read(recording, topic, kind="sensor_msgs/msg/NavSatFix", option="--gnss")
+        messages = read(recording, topic, kinds=["sensor_msgs/msg/NavSatFix"], option="--gnss")
         return [row_of(messages[number][1]) for number in range(len(messages))]
     except SegslamError:
         raise

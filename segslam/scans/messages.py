@@ -1,10 +1,12 @@
 """Messages on one topic of a recording: of ROS bags (1 and 2), read in order; of MCAP files, found by their index."""
 
+import heapq
 import struct
 import weakref
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from io import BytesIO
+from operator import itemgetter
 from pathlib import Path
 from typing import IO, Any, Generic, NamedTuple, TypeVar
 
@@ -20,9 +22,9 @@ from mcap.summary import Summary
 from segslam.core.config import parse_yaml
 from segslam.core.errors import SegslamError, counted
 from segslam.core.extras import how_to_install
+from segslam.scans.decoding import CLOUDS, decoder
 from segslam.scans.scan_files import MAX_SCAN_BYTES
 
-CLOUD = "sensor_msgs/msg/PointCloud2"
 Message = TypeVar("Message")
 MIN_BYTES = 32
 """Fewest bytes of a message with a cloud, compressed or not: its record header and stamp."""
@@ -72,7 +74,7 @@ class InOrder(Generic[Message]):
 
 
 class BagMessages:
-    """Messages of one kind, read in order. Replaces kiss_icp's reader, which ends the program for a missing topic.
+    """Messages of some kinds, read in order. Replaces kiss_icp's reader, which ends the program for a missing topic.
 
     Raises SegslamError if the bag has no such topic or its metadata are damaged, ImportError if the package is missing,
     and what rosbags raises.
@@ -80,10 +82,11 @@ class BagMessages:
 
     is_sequential = True
 
-    def __init__(self, data: Path, topic: str, *, kind: str = CLOUD, option: str = "--topic") -> None:
-        """`option` is that which names the topic, for messages; an empty topic is the only one of this kind."""
+    def __init__(self, data: Path, topic: str, *, kinds: Sequence[str] = CLOUDS, option: str = "--topic") -> None:
+        """`option` is that which names the topic, for messages; an empty topic is the only one of these kinds."""
         try:
-            from rosbags.highlevel import AnyReader
+            from rosbags.rosbag1 import Reader as Reader1
+            from rosbags.rosbag2 import Reader as Reader2
         except ImportError as error:
             raise ImportError(f"reading ROS bags needs a package: {how_to_install('recordings')}") from error
         files = [file for file in sorted(data.glob("*.bag")) if not file.name.startswith(".")] if data.is_dir() else []
@@ -91,15 +94,24 @@ class BagMessages:
         if not files and metadata.is_file():
             # rosbags needs seconds before it refuses a damaged text that is nested deeply
             parse_yaml(metadata.read_text(encoding="utf-8"), str(metadata))
-        self._bag = AnyReader(files or [data])
-        self._bag.open()
-        weakref.finalize(self, _close, self._bag)
-        counts = {name: info.msgcount for name, info in self._bag.topics.items() if info.msgtype == kind}
-        topic = one_topic(data, counts, topic, kind=kind, option=option)
-        self._connections = [connection for connection in self._bag.connections if connection.topic == topic]
+        is_ros1 = bool(files) or data.suffix == ".bag"
+        open_reader = Reader1 if is_ros1 else Reader2
+        connections = {}
+        for file in files or [data]:
+            reader = open_reader(file)
+            reader.open()
+            weakref.finalize(self, _close, reader)
+            connections[reader] = [one for one in reader.connections if one.msgtype in kinds]
+        topics = {one.topic for known in connections.values() for one in known}
+        topic = one_topic(data, topics, topic, kinds=kinds, option=option)
+        self._connections = {
+            reader: [one for one in known if one.topic == topic] for reader, known in connections.items()
+        }
+        found = [one for known in self._connections.values() for one in known]
+        self._decode = {one.msgtype: decoder(one.msgtype, is_ros1=is_ros1) for one in found}
         stored = [file for path in files or [data] for file in ([path] if path.is_file() else path.iterdir())]
-        num_bytes = sum(file.stat().st_size for file in stored if file.is_file())
-        self._raw = InOrder(self._messages, counts[topic], num_bytes=num_bytes if kind == CLOUD else None)
+        num_bytes = sum(file.stat().st_size for file in stored if file.is_file()) if kinds == CLOUDS else None
+        self._raw = InOrder(self._messages, sum(one.msgcount for one in found), num_bytes=num_bytes)
 
     def __len__(self) -> int:
         return len(self._raw)
@@ -107,10 +119,12 @@ class BagMessages:
     def __getitem__(self, index: int) -> tuple[int, Any]:
         """Log time (ns) and decoded message. Raises what rosbags raises for a damaged one."""
         log_ns, data, kind = self._raw[index]
-        return log_ns, self._bag.deserialize(data, kind)
+        return log_ns, self._decode[kind](data)
 
     def _messages(self) -> Iterator[tuple[int, bytes, str]]:
-        for connection, log_ns, data in self._bag.messages(connections=self._connections):
+        # of no connections, rosbags gives all messages
+        streams = [reader.messages(connections=known) for reader, known in self._connections.items() if known]
+        for connection, log_ns, data in heapq.merge(*streams, key=itemgetter(1)):
             yield log_ns, data, connection.msgtype
 
 
@@ -123,19 +137,15 @@ class _Place(NamedTuple):
 
 
 class McapMessages:
-    """Messages of one kind, by their order in time; replaces kiss_icp's reader, which fails with mcap-ros2-support 0.6.
+    """Messages of some kinds, by their order in time, of ROS 1 or 2. Replaces kiss_icp's reader, which needs ROS 2.
 
     A message in a damaged chunk cannot be read; the others can. In a file without chunks, or without an index of their
     messages, none after the damage can. Raises ValueError if the file has no index, SegslamError if it is no MCAP file
-    or has no such topic, ImportError if the decoding package is missing.
+    or has no such topic, ImportError if rosbags is missing.
     """
 
-    def __init__(self, file: Path, topic: str, *, kind: str = CLOUD, option: str = "--topic") -> None:
+    def __init__(self, file: Path, topic: str, *, kinds: Sequence[str] = CLOUDS, option: str = "--topic") -> None:
         """As `BagMessages`."""
-        try:
-            from mcap_ros2.decoder import DecoderFactory
-        except ImportError as error:
-            raise ImportError(f"reading ROS 2 messages needs a package: {how_to_install('recordings')}") from error
         self._file = file
         self._chunk: tuple[int, bytes] = (-1, b"")
         with file.open("rb") as stream:
@@ -147,26 +157,25 @@ class McapMessages:
             known = [one for one in summary.channels.values() if one.schema_id]
             if not summary.channels or any(one.schema_id not in summary.schemas for one in known):
                 raise ValueError("its index lacks channels or schemas; `mcap recover` adds them")
-            names = (kind, kind.replace("/msg/", "/"))  # of ROS 2, and of ROS 1
+            names = {kind.replace("/msg/", "/"): kind for kind in kinds} | {kind: kind for kind in kinds}  # ROS 1, 2
             alike = [one for one in known if summary.schemas[one.schema_id].name in names]
-            self._topic = one_topic(file, {one.topic for one in alike}, topic, kind=kind, option=option)
+            self._topic = one_topic(file, {one.topic for one in alike}, topic, kinds=kinds, option=option)
             channels = {one.id: one for one in alike if one.topic == self._topic}
             counts = summary.statistics.channel_message_counts
             self._num_messages = sum(counts.get(id, 0) for id in channels)
             self._places = _places(stream, summary, channels)
         self._decode: dict[int, Callable[[bytes], Any]] = {}
         for id, one in channels.items():
-            schema = summary.schemas[one.schema_id]
-            decode = DecoderFactory().decoder_for(one.message_encoding, schema)
-            if decode is None:
+            if one.message_encoding not in ("cdr", "ros1"):
                 raise SegslamError(
-                    f"{file}: messages on {one.topic} are encoded as {one.message_encoding} ({schema.encoding}), not "
-                    "as ROS 2's cdr (ros2msg); give the bag of ROS 1, or convert it to ROS 2"
+                    f"{file}: messages on {one.topic} are encoded as {one.message_encoding}, not as those of ROS 1 "
+                    "(ros1) or ROS 2 (cdr); give the bag from which it was converted"
                 )
-            self._decode[id] = decode
+            kind = names[summary.schemas[one.schema_id].name]
+            self._decode[id] = decoder(kind, is_ros1=one.message_encoding == "ros1")
         self._in_order = None
         if len(self._places) != self._num_messages:
-            num_bytes = file.stat().st_size if kind == CLOUD else None
+            num_bytes = file.stat().st_size if kinds == CLOUDS else None
             self._in_order = InOrder(self._messages, self._num_messages, num_bytes=num_bytes)
         self.is_sequential = self._in_order is not None
 
@@ -198,12 +207,12 @@ class McapMessages:
                     yield message
 
 
-def one_topic(recording: Path, known: Collection[str], wanted: str, *, kind: str, option: str) -> str:
+def one_topic(recording: Path, known: Collection[str], wanted: str, *, kinds: Sequence[str], option: str) -> str:
     """The wanted topic, or the only one. Raises SegslamError with the known ones."""
     found = [name for name in known if name == wanted or not wanted]
     if len(found) != 1:
         topics = ", ".join(f"{option} {name}" for name in sorted(known)) or "none"
-        raise SegslamError(f"{recording}: give one topic of type {kind}; the recording has: {topics}")
+        raise SegslamError(f"{recording}: give one topic of type {' or '.join(kinds)}; the recording has: {topics}")
     return found[0]
 
 

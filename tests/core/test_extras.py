@@ -11,7 +11,7 @@ from segslam.core.extras import how_to_install, requirements
 from segslam.core.types import SegslamError
 from segslam.gnss import Origin
 from segslam.output.map import write
-from segslam.scans.messages import McapMessages
+from segslam.scans.decoding import CLOUD, decoder
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
@@ -43,6 +43,6 @@ def test_las_and_ros_messages_have_the_install_command(tmp_path: Path, monkeypat
         patch.setattr(write, "find_spec", lambda name: None if name == "pyproj" else object())
         with pytest.raises(SegslamError, match=r"pip install 'pyproj<.*' 'rasterio<"):
             write.check_names([tmp_path / "map.laz"], origin=Origin(48.98, 8.39, 115.0))
-    monkeypatch.setitem(sys.modules, "mcap_ros2.decoder", None)
-    with pytest.raises(ImportError, match="pip install 'mcap-ros2-support<"):
-        McapMessages(tmp_path / "drive.mcap", "")
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    with pytest.raises(ImportError, match="pip install 'rosbags<"):
+        decoder(CLOUD, is_ros1=False)

@@ -109,7 +109,7 @@ def write_bag1(file: Path, drive: Drive = ()) -> Path:
     store = get_typestore(Stores.ROS1_NOETIC)
     with Bag1Writer(file) as writer:
         connection = writer.add_connection(TOPIC, MESSAGE, typestore=store)
-        for received_ns, message in _messages(store, drive):
+        for received_ns, message in messages(store, drive):
             writer.write(connection, received_ns, store.serialize_ros1(message, MESSAGE))
     return file
 
@@ -118,7 +118,7 @@ def write_bag2(folder: Path, drive: Drive = ()) -> Path:
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Bag2Writer(folder, version=8) as writer:
         connection = writer.add_connection(TOPIC, MESSAGE, typestore=store)
-        for received_ns, message in _messages(store, drive):
+        for received_ns, message in messages(store, drive):
             writer.write(connection, received_ns, store.serialize_cdr(message, MESSAGE))
     return folder
 
@@ -142,7 +142,7 @@ def _as_dict(stamp_ns: int, rows: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _messages(store: Any, drive: Drive) -> Iterator[tuple[int, Any]]:
+def messages(store: Any, drive: Drive) -> Iterator[tuple[int, Any]]:
     """When each message was received, some time after its stamp, and the message in rosbags' types."""
     types = store.types
     more = {"seq": 0} if "seq" in types["std_msgs/msg/Header"].__dataclass_fields__ else {}

@@ -156,12 +156,11 @@ def _written_by_mcap(file: Path, *, name: str, message_encoding: str, schema_enc
     return file
 
 
-def test_clouds_of_ros_1_in_mcap_are_named_so(tmp_path: Path) -> None:
-    """`mcap convert drive.bag drive.mcap` keeps the encoding of ROS 1."""
-    how = {"name": "sensor_msgs/PointCloud2", "message_encoding": "ros1", "schema_encoding": "ros1msg"}
+def test_clouds_of_another_encoding_in_mcap_are_named_so(tmp_path: Path) -> None:
+    how = {"name": "sensor_msgs/PointCloud2", "message_encoding": "json", "schema_encoding": "jsonschema"}
     file = _written_by_mcap(tmp_path / "a.mcap", **how, is_repeated=True)
     with pytest.raises(
-        SegslamError, match=r"a\.mcap: messages on /points are encoded as ros1 .*; give the bag of ROS 1"
+        SegslamError, match=r"a\.mcap: messages on /points are encoded as json, not as .*; give the bag from which"
     ):
         open_dataset(file)
 

@@ -1,5 +1,6 @@
 """Recordings made by others' writers, from the file to the map."""
 
+import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
@@ -7,11 +8,19 @@ import numpy as np
 import open3d as o3d
 import pytest
 from helpers.commands import run
+from helpers.other_recordings import (
+    write_humble,
+    write_livox_bag1,
+    write_livox_bag2,
+    write_livox_mcap,
+    write_mcap_of_ros1,
+)
 from helpers.recorded_drive import (
     FIRST_STAMP_NS,
     OTHER_TOPIC,
     SWEEP_NS,
     TOPIC,
+    Drive,
     clouds,
     truth,
     write_bag1,
@@ -21,7 +30,7 @@ from helpers.recorded_drive import (
 
 from segslam.core.evaluation import trajectory_metrics
 from segslam.core.trajectory import read_poses
-from segslam.core.types import SegslamError
+from segslam.core.types import BadScan, SegslamError
 from segslam.gnss.reading import read_fixes
 from segslam.scans import open_dataset
 
@@ -29,7 +38,14 @@ pytestmark = pytest.mark.usefixtures("short_runs")
 
 
 @pytest.mark.parametrize(
-    ("write", "name"), [(write_mcap, "drive.mcap"), (write_bag1, "drive.bag"), (write_bag2, "drive")]
+    ("write", "name"),
+    [
+        (write_mcap, "drive.mcap"),
+        (write_bag1, "drive.bag"),
+        (write_bag2, "drive"),
+        (write_humble, "drive"),
+        (write_mcap_of_ros1, "drive.mcap"),
+    ],
 )
 def test_a_recording_gives_its_points_with_times_in_step_and_its_stamps(
     tmp_path: Path, write: Callable[[Path], Path], name: str
@@ -42,6 +58,39 @@ def test_a_recording_gives_its_points_with_times_in_step_and_its_stamps(
         assert scan.stamp_ns == stamp_ns, "the header's, not when it was received"
         np.testing.assert_array_equal(scan.points, np.column_stack([returned[axis] for axis in "xyz"]))
         np.testing.assert_allclose(scan.times, returned["t"] / SWEEP_NS, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [(write_livox_mcap, "drive.mcap"), (write_livox_bag1, "drive.bag"), (write_livox_bag2, "drive")],
+)
+def test_the_messages_of_livox_are_read_as_clouds(
+    tmp_path: Path, write: Callable[[Path, Drive], Path], name: str
+) -> None:
+    drive = tuple((stamp_ns, rows[1:500]) for stamp_ns, rows in clouds()[:2])
+    dataset = open_dataset(write(tmp_path / name, drive), intensities=True)
+    assert len(dataset) == 2
+    for scan, (stamp_ns, rows) in zip(dataset, drive, strict=True):
+        returned = rows[np.isfinite(rows["x"])]
+        assert (scan.stamp_ns, scan.stamp_time) == (stamp_ns, 0.0)
+        np.testing.assert_array_equal(scan.points, np.column_stack([returned[axis] for axis in "xyz"]))
+        np.testing.assert_array_equal(scan.intensities, np.floor(returned["intensity"]))
+        np.testing.assert_allclose(scan.times, returned["t"] / SWEEP_NS, atol=1e-12)
+
+
+def test_a_message_of_livox_that_is_cut_short_is_a_bad_scan(tmp_path: Path) -> None:
+    drive = tuple((stamp_ns, rows[1:50]) for stamp_ns, rows in clouds()[:3])
+    recording = write_livox_bag2(tmp_path / "drive", drive)
+    with sqlite3.connect(next(recording.glob("*.db3"))) as database:
+        whole = database.execute("SELECT data FROM messages WHERE id = 2").fetchone()[0]
+        for length, complaint in ((len(whole) - 2, "49 points"), (30, "unpack_from requires")):
+            database.execute("UPDATE messages SET data = ? WHERE id = 2", (whole[:length],))
+            database.commit()
+            dataset = open_dataset(recording)
+            with pytest.raises(BadScan, match=complaint):
+                dataset[1]
+            assert len(list(dataset)) == 2
+    database.close()
 
 
 @pytest.mark.parametrize("has_stamps", [True, False])

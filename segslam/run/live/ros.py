@@ -33,7 +33,7 @@ from segslam.gnss.fixes import Row
 from segslam.gnss.reading import row_of
 from segslam.run.live.live_map import DrawnMap
 from segslam.run.live.waiting import Arrival, Source, Waiting
-from segslam.scans.messages import CLOUD
+from segslam.scans.decoding import CLOUD
 from segslam.scans.point_cloud2 import read_message, stamp_ns_of
 
 try:

@@ -51,6 +51,8 @@ CHANNELS = {
 """By profile name."""
 HEADER_BYTES = 32
 """Bytes before and after the columns of a packet, except in the legacy profile."""
+FRAME_IDS = {"STANDARD": ("<u2", 2), "FUSA": ("<u4", 4)}
+"""Type of the frame's number in the header of a packet, and its offset; the legacy profile has it in each column."""
 MAX_COLUMNS, MAX_BEAMS = 4096, 256
 """Largest numbers in metadata. Chosen: the largest sensors have 4096 columns and 128 beams."""
 
@@ -60,6 +62,8 @@ class _Sensor:
     """The sensor's metadata, from either of the two layouts."""
 
     profile: str
+    header: str
+    """Key of FRAME_IDS."""
     port: int | None
     columns_per_frame: int
     columns_per_packet: int
@@ -130,22 +134,30 @@ class OusterFrames:
         )
 
     def _find_frames(self) -> list[list[list[slice]]]:
-        """Payloads by frame. A frame starts where the column number decreases by more than half a revolution."""
+        """Payloads by frame, as their packets are numbered; a packet of the frame before may arrive late."""
         sensor = self._sensor
         frames: list[list[list[slice]]] = []
-        last = sensor.columns_per_frame
+        recent: dict[int, list[list[slice]]] = {}
         num_bytes = 2 * sensor.header_bytes + sensor.columns_per_packet * sensor.column_dtype.itemsize
         for payload in udp_payloads(self._content, num_bytes=num_bytes, port=sensor.port):
-            number = int(self._columns(payload)["measurement"][0])
-            if not frames or last - number > sensor.columns_per_frame // 2:
+            number = self._frame_number(payload)
+            if number not in recent:
                 frames.append([])
-            frames[-1].append(payload)
-            last = number
+                recent = dict([*recent.items()][-1:]) | {number: frames[-1]}
+            recent[number].append(payload)
         return frames
 
+    def _frame_number(self, payload: list[slice]) -> int:
+        if self._sensor.profile == "LEGACY":
+            return int(self._columns(payload)["frame"][0])
+        kind, offset = FRAME_IDS[self._sensor.header]
+        return int(np.frombuffer(self._packet(payload), kind, 1, offset)[0])
+
+    def _packet(self, payload: list[slice]) -> bytes:
+        return b"".join(self._content[piece] for piece in payload)
+
     def _columns(self, payload: list[slice]) -> np.ndarray:
-        packet = b"".join(self._content[piece] for piece in payload)
-        sensor = self._sensor
+        sensor, packet = self._sensor, self._packet(payload)
         return np.frombuffer(packet, sensor.column_dtype, sensor.columns_per_packet, offset=sensor.header_bytes)
 
     @cached_property
@@ -179,8 +191,13 @@ def _read_sensor(file: Path) -> _Sensor:
         profile = str(values.get("udp_profile_lidar", "LEGACY"))
         if profile not in CHANNELS:
             raise ValueError(f"packets of profile {profile}; known: {', '.join(CHANNELS)}")
+        by_profile = "FUSA" if profile.startswith("FUSA") else "STANDARD"
+        header = str(values.get("header_type", by_profile))  # since firmware 3.2
+        if header not in FRAME_IDS:
+            raise ValueError(f"packets with headers of type {header}; known: {', '.join(FRAME_IDS)}")
         return _Sensor(
             profile=profile,
+            header=header,
             port=int(values.get("udp_port_lidar") or 0) or None,
             columns_per_frame=int(values["columns_per_frame"]),
             columns_per_packet=int(values["columns_per_packet"]),

@@ -57,13 +57,16 @@ def column(profile: str, frame: int, number: int, ranges_mm: np.ndarray, *, vali
 
 
 def frames(profile: str, ranges_mm: list[np.ndarray]) -> Iterator[bytes]:
-    """The packets of some frames, each frame (columns, beams) ranges; columns of negative range are not valid."""
-    around = b"" if profile == "LEGACY" else b"\xee" * 32
+    """The packets of some frames, each frame (columns, beams) ranges; columns of negative range are not valid.
+
+    A frame may have fewer columns, as that of a sensor with an azimuth window.
+    """
     for frame, image in enumerate(ranges_mm):
-        for first in range(0, NUM_COLUMNS, PER_PACKET):
+        header = b"" if profile == "LEGACY" else struct.pack("<HH", 1, 65_535 + frame & 0xFFFF).ljust(32, b"\xee")
+        for first in range(0, len(image), PER_PACKET):
             rows = range(first, first + PER_PACKET)
             columns = [column(profile, frame, row, abs(image[row]), valid=image[row].min() >= 0) for row in rows]
-            yield around + b"".join(columns) + around
+            yield header + b"".join(columns) + b"\xee" * len(header)
 
 
 def datagrams(payload: bytes, *, port: int = 7502, number: int = 1, mtu: int = 1500, vlan: bool = False) -> list[bytes]:

@@ -43,6 +43,38 @@ def test_stamps_and_times_are_the_sensors(tmp_path: Path) -> None:
     np.testing.assert_allclose(scans[1].times, np.repeat(np.arange(16) / 15, 2))
 
 
+@pytest.mark.parametrize("profile", ["LEGACY", "RNG15_RFL8_NIR8_DUAL"])
+def test_frames_of_a_sensor_with_an_azimuth_window_are_separated(tmp_path: Path, profile: str) -> None:
+    half_turn = np.full((NUM_COLUMNS // 2, 2), 3000)
+    scans = list(open_dataset(record(tmp_path, profile, [half_turn] * 3)))
+    assert [(scan.stamp_ns - START_NS, len(scan.points)) for scan in scans] == [
+        (frame * 100_000_000, NUM_COLUMNS) for frame in range(3)
+    ]
+
+
+def test_a_late_packet_belongs_to_its_frame(tmp_path: Path) -> None:
+    profile = "RNG19_RFL8_SIG16_NIR16"
+    packets = [datagrams(p, number=i) for i, p in enumerate(frames(profile, [np.full((NUM_COLUMNS, 2), 3000)] * 2))]
+    packets[3], packets[4] = packets[4], packets[3]
+    dataset = open_dataset(write(tmp_path, [frame for group in packets for frame in group], metadata(profile)))
+    assert [len(scan.points) for scan in dataset] == [2 * NUM_COLUMNS] * 2
+
+
+def test_the_header_of_functional_safety_numbers_frames_elsewhere(tmp_path: Path) -> None:
+    profile = "RNG19_RFL8_SIG16_NIR16"
+    packets = [
+        p[:2] + b"\0\0" + (70_000 + number // 4).to_bytes(4, "little") + p[8:]
+        for number, p in enumerate(frames(profile, [np.full((NUM_COLUMNS, 2), 3000)] * 2))
+    ]
+    known = metadata(profile)
+    known["lidar_data_format"]["header_type"] = "FUSA"
+    sent = [frame for number, p in enumerate(packets) for frame in datagrams(p, number=number)]
+    assert [len(scan.points) for scan in open_dataset(write(tmp_path, sent, known))] == [2 * NUM_COLUMNS] * 2
+    known["lidar_data_format"]["header_type"] = "OTHER"
+    with pytest.raises(SegslamError, match="headers of type OTHER; known: STANDARD, FUSA"):
+        open_dataset(write(tmp_path, sent, known))
+
+
 @pytest.mark.parametrize("how", [{"mtu": 64}, {"vlan": True}, {"mtu": 64, "vlan": True}])
 def test_split_and_tagged_packets_give_the_same_points(tmp_path: Path, how: dict) -> None:
     image = np.arange(1000, 1000 + 2 * NUM_COLUMNS).reshape(NUM_COLUMNS, 2) * 8

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from segslam.core.errors import brief
+from segslam.core.trajectory import LATEST_S
 from segslam.core.types import SegslamError
 from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
 
@@ -37,8 +38,6 @@ ORDER = ("time", "latitude", "longitude", "height", "sigma_east", "sigma_north",
 NEEDED = ("latitude", "longitude")
 LEAST_STATUS = {"status": 0.0, "quality": 1.0}
 """Least number of a fix: a status as in NavSatFix is -1 for none, a quality as in NMEA 0."""
-LATEST_S = 4_000_000_000
-"""Times above this are not seconds since 1970 (the year 2096) but milli-, micro- or nanoseconds."""
 
 
 def read_csv(file: Path, lines: Sequence[str]) -> list[Row]:
@@ -120,7 +119,7 @@ def _row(file: Path, number: int, cells: Sequence[str], places: dict[str, int]) 
 
 
 def _stamp(file: Path, number: int, text: str, *, is_ns: bool) -> int:
-    """Time in ns of a number, in ns or the unit that its size shows, or of a date in ISO 8601."""
+    """Time in ns of a number, in ns or the unit that its size shows (LATEST_S), or of a date in ISO 8601."""
     text = text.strip()
     try:
         if re.match(r"\d{4}-\d\d-\d\d", text):

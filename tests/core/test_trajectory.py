@@ -84,6 +84,62 @@ def test_a_line_of_column_names_is_read_over_in_csv_alone(tmp_path: Path) -> Non
         trajectory.read_poses(tmp_path / "a.txt")
 
 
+EUROC = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "
+    "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1]"
+)
+ECHOED = "%time,field.header.seq,field.child_frame_id," + ",".join(
+    [f"field.pose.pose.position.{axis}" for axis in "xyz"]
+    + [f"field.pose.pose.orientation.{axis}" for axis in "xyzw"]
+    + [f"field.twist.twist.linear.{axis}" for axis in "xyz"]
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("orb_slam3.txt", "1700000000123456789.000000 1 2 3 0.6 0 0 0.8"),
+        ("helipr.txt", "1700000000123456789 1 2 3 0.6 0 0 0.8"),
+        ("newer_college.csv", "#sec,nsec,x,y,z,qx,qy,qz,qw\n1700000000,123456789,1,2,3,0.6,0,0,0.8"),
+        ("newer_college.csv", "sec, nsec, x, y, z, qx, qy, qz, qw\n1700000000,123456789,1,2,3,0.6,0,0,0.8"),
+        ("euroc.csv", f"# EuRoC\n{EUROC}\n1700000000123456789,1,2,3,0.8,0.6,0,0,9,9,9,9"),
+        ("tum_vi.csv", "#timestamp [ns],tx,ty,tz,qw,qx,qy,qz\r\n1700000000123456789,1,2,3,0.8,0.6,0,0\r"),
+        ("w_first.txt", "# timestamp(s) tx ty tz qw qx qy qz\n\n1700000000.123456789 1 2 3 0.8 0.6 0 0"),
+        ("echoed.csv", f"{ECHOED}\n1700000000123456789,7,base_link,1,2,3,0.6,0,0,0.8,9,9,9"),
+    ],
+)
+def test_trajectories_of_other_programs_are_read(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text + "\n")
+    read = trajectory.read_poses(tmp_path / name)
+    assert read.stamp_ns is not None
+    assert read.stamp_ns.tolist() == [1_700_000_000_123_456_789]
+    np.testing.assert_allclose(read.T_a_b[0, :3, 3], [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(read.T_a_b[0, :3, 1], [0.0, 0.28, 0.96])
+
+
+def test_a_time_that_is_named_in_nanoseconds_may_count_from_any_start(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t_ns,x,y,z,qx,qy,qz,qw\n1500000000,0,0,0,0,0,0,1\n")
+    assert trajectory.read_poses(tmp_path / "a.csv").stamp_ns == [1_500_000_000]
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        ("0,0,1,2,3,0,0,0", r"a\.csv:3: found 8 columns, but the line of names has 9"),
+        ("never,0,1,2,3,0,0,0,1", r"a\.csv:3: never 0 is not a time"),
+    ],
+)
+def test_a_line_that_does_not_fit_the_names_is_named(tmp_path: Path, line: str, complaint: str) -> None:
+    (tmp_path / "a.csv").write_text(f"#sec,nsec,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,0,1\n{line}\n")
+    with pytest.raises(SegslamError, match=complaint):
+        trajectory.read_poses(tmp_path / "a.csv", format="tum")
+
+
+def test_a_comment_that_is_no_line_of_names_changes_nothing(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("# saved by lazy z x y z w\n1.5 1 2 3 0 0 0 1\n")
+    assert trajectory.read_poses(tmp_path / "a.txt").T_a_b[0, :3, 3].tolist() == [1.0, 2.0, 3.0]
+
+
 @pytest.mark.parametrize(
     ("line", "complaint"),
     [
@@ -183,6 +239,11 @@ def test_scans_pair_by_number_whatever_the_order() -> None:
         ("1.5", 1_500_000_000),
         ("4.574208e+02", 457_420_800_000),
         ("1764000000.123456789", 1764000000123456789),
+        ("1764000000123", 1764000000123000000),
+        ("1764000000123456", 1764000000123456000),
+        ("1764000000123456789", 1764000000123456789),
+        ("1.764000000123456789e18", 1764000000123456789),
+        ("4000000000", 4_000_000_000_000_000_000),
     ],
 )
 def test_seconds_become_exact_nanoseconds(text: str, stamp_ns: int) -> None:

@@ -19,6 +19,7 @@ from segslam.core.types import BadScan, SegslamError, Trajectory
 from segslam.labels.label_files import open_labels
 from segslam.scans.clouds import SUFFIXES, read_file
 from segslam.scans.dataset import Cloud, Dataset, DataSource, check_num_lines, no_topics, read_stamps, selected_rows
+from segslam.scans.named_stamps import stamps_of_names
 
 ASSUMED_PERIOD_NS = 100_000_000  # 10 Hz, the rate of most LiDARs; used if there are no stamps
 KIND_OF_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "ouster"}
@@ -51,6 +52,8 @@ class Recording(Dataset):
         elif hasattr(self._loader, "get_frames_timestamps"):
             times_s = np.asarray(self._loader.get_frames_timestamps(), dtype=float)
             self._stamps = np.rint(times_s.ravel() * 1e9).astype(np.int64)
+        elif (named := stamps_of_names([self._file(index) for index in range(self.num_recorded)])) is not None:
+            self._stamps = named
         self.scan_index = selected_rows(np.arange(self.num_recorded), source.frames, self._source)
         self.names = [self._file(int(index)).stem for index in self.scan_index]
         self.labels = open_labels(source.labels, beside=beside, scan_names=self.names, encoding=source.encoding)
@@ -99,7 +102,7 @@ class Recording(Dataset):
 
 
 class ScanFolder:
-    """The scans of a folder: all files of one format, without hidden ones. Numbers in names are sorted by value."""
+    """The scans of a folder: all files of one format, without hidden ones, by the stamps or the numbers in names."""
 
     def __init__(self, folder: Path) -> None:
         self.scan_files = scan_files(folder)
@@ -125,7 +128,9 @@ def scan_files(folder: Path) -> list[Path]:
     if len(counts) > 1:
         listed = ", ".join(f"{suffix} {count}" for suffix, count in counts.items())
         raise SegslamError(f"{folder}: {len(counts)} kinds of scans ({listed}); put each kind into its own folder")
-    return sorted(files, key=_by_numbers)
+    files.sort(key=_by_numbers)
+    stamps = stamps_of_names(files)
+    return files if stamps is None else [files[row] for row in np.argsort(stamps)]
 
 
 def _by_numbers(file: Path) -> tuple[list[str | int], str]:

@@ -24,7 +24,7 @@ from segslam.odometry.kiss import KissOdometry
 from segslam.output.finished import read_run
 from segslam.output.log import LogWriter, read_log
 from segslam.output.words import FIGURES
-from segslam.run.live.folder import FolderSource, stamp_of_name
+from segslam.run.live.folder import FolderSource
 from segslam.run.live.front import Front
 from segslam.run.live.waiting import Rhythm, Tally, Waiting
 from segslam.scans import open_dataset
@@ -94,21 +94,6 @@ def test_a_pause_of_an_hour_is_a_gap() -> None:
     for stamp_s in (0, 1, 2, 3, 3603):
         rhythm.note(stamp_s * 10**9)
     assert (rhythm.tally.num_clock_set, rhythm.tally.num_gaps, rhythm.tally.longest_gap_s) == (0, 1, 3600.0)
-
-
-@pytest.mark.parametrize(
-    ("name", "stamp_ns"),
-    [
-        ("1700000000.25", 1_700_000_000_250_000_000),
-        ("1700000000_000000001", 1_700_000_000_000_000_001),
-        ("1700000000123456789", 1_700_000_000_123_456_789),
-        ("1700000000123456", 1_700_000_000_123_456_000),
-        ("000123", None),
-        ("scan_1700000000.25", None),
-    ],
-)
-def test_the_name_of_a_file_can_hold_its_stamp(name: str, stamp_ns: int | None) -> None:
-    assert stamp_of_name(name) == stamp_ns
 
 
 def test_a_file_is_read_once_when_it_is_closed_or_renamed(tmp_path: Path) -> None:

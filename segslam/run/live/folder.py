@@ -2,7 +2,6 @@
 
 import ctypes
 import os
-import re
 import select
 import struct
 from collections import OrderedDict
@@ -18,6 +17,7 @@ from segslam.core.errors import counted, unreadable
 from segslam.core.types import BadScan, Scan, SegslamError
 from segslam.run.live.waiting import WAKE_S, Source, Waiting
 from segslam.scans.clouds import SUFFIXES, read_file
+from segslam.scans.named_stamps import stamp_of_name
 
 IN_CLOSE_WRITE, IN_MOVED_TO = 0x8, 0x80
 IN_DELETE_SELF, IN_MOVE_SELF, IN_UNMOUNT, IN_Q_OVERFLOW = 0x400, 0x800, 0x2000, 0x4000
@@ -27,7 +27,6 @@ EVENT = struct.Struct("iIII")
 """Watch, mask, cookie and length of the following name."""
 NAMES_KEPT = 1000
 """Number of names whose last content is remembered: a file that is closed again without a change is the same scan."""
-STAMP_NAME = re.compile(r"(?P<s>\d{9,10})[._-](?P<fraction>\d{1,9})|(?P<ns>\d{19})|(?P<us>\d{16})")
 
 
 class FolderSource(Source):
@@ -131,18 +130,6 @@ class FolderSource(Source):
         if found.st_size != content[1] or found.st_mtime_ns > content[0]:
             raise BadScan(f"{file}: written again before it was read; give each scan a file of its own")
         return scan
-
-
-def stamp_of_name(stem: str) -> int | None:
-    """The stamp in a file name: seconds with a fraction, or 19 digits of ns or 16 of us since 1970; or None."""
-    found = STAMP_NAME.fullmatch(stem)
-    if found is None:
-        return None
-    if found["ns"]:
-        return int(found["ns"])
-    if found["us"]:
-        return 1000 * int(found["us"])
-    return int(found["s"]) * 1_000_000_000 + int(found["fraction"].ljust(9, "0"))
 
 
 def _events(data: bytes) -> Iterator[tuple[int, str]]:

@@ -1,4 +1,4 @@
-"""Pose graphs as g2o text: the tags VERTEX_SE3:QUAT, EDGE_SE3:QUAT and FIX.
+"""Pose graphs as g2o text: the tags VERTEX_SE3:QUAT, EDGE_SE3:QUAT and FIX. PARAMS lines belong to other edges.
 
 A vertex is `id x y z qx qy qz qw`; an edge is `a b`, the pose of b in a as for a vertex, and the upper triangle of its
 information, row by row. g2o puts translation before rotation, segslam after it: only this module converts.
@@ -24,6 +24,8 @@ from segslam.graph.edges import Edge, Transforms
 VERTEX, EDGE, FIX = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "FIX"
 NUM_FIELDS = {VERTEX: 8, EDGE: 30, FIX: 1}
 """Ids included, the tag not."""
+UNUSED = "PARAMS_"
+"""Begin of the tags of sensor offsets and cameras, which edges between poses do not use."""
 UPPER = np.triu_indices(6)
 OTHER_ORDER = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
 """Turns [translation; rotation] into [rotation; translation], and back."""
@@ -48,6 +50,19 @@ class _Table:
     line_numbers: list[int]
     ids: list[list[int]]
     numbers: list[list[float]]
+
+    def add(self, line_number: int, texts: list[str], *, num_ids: int) -> None:
+        """Add a row; raises SegslamError for texts that are no ids, or no finite numbers."""
+        self.line_numbers.append(line_number)
+        try:
+            self.ids.append([int(text) for text in texts[:num_ids]])
+            self.numbers.append([float(text) for text in texts[num_ids:]])
+        except ValueError as error:
+            raise self.refusal(-1, brief(str(error))) from error
+        if not 0 <= min(self.ids[-1]) <= max(self.ids[-1]) < 2**63:
+            raise self.refusal(-1, "ids are at least 0 and below 2**63")
+        if not all(abs(number) <= LARGEST for number in self.numbers[-1]):
+            raise self.refusal(-1, NOT_FINITE)
 
     def refusal(self, row: SupportsIndex, what: str) -> SegslamError:
         return SegslamError(f"{self.path}:{self.line_numbers[row]}: {what}; correct or remove the line")
@@ -107,21 +122,13 @@ def _read_tables(path: Path) -> tuple[_Table, _Table, _Table]:
     tables = {tag: _Table(path, [], [], []) for tag in (VERTEX, EDGE, FIX)}
     for number, line in enumerate(text.split("\n"), start=1):
         tag, *texts = line.partition("#")[0].split() or [""]
-        if not tag:
+        if not tag or tag.startswith(UNUSED):
             continue
-        if len(texts) != NUM_FIELDS.get(tag):
-            raise SegslamError(f"{path}:{number}: {_complaint(tag, len(texts))}")
-        table, num_ids = tables[tag], 2 if tag == EDGE else 1
-        table.line_numbers.append(number)
-        try:
-            table.ids.append([int(text) for text in texts[:num_ids]])
-            table.numbers.append([float(text) for text in texts[num_ids:]])
-        except ValueError as error:
-            raise table.refusal(-1, brief(str(error))) from error
-        if not 0 <= min(table.ids[-1]) <= max(table.ids[-1]) < 2**63:
-            raise table.refusal(-1, "ids are at least 0 and below 2**63")
-        if not all(abs(number) <= LARGEST for number in table.numbers[-1]):
-            raise table.refusal(-1, NOT_FINITE)
+        rows = [[text] for text in texts] if tag == FIX and texts else [texts]  # FIX may name several vertices
+        for row in rows:
+            if len(row) != NUM_FIELDS.get(tag):
+                raise SegslamError(f"{path}:{number}: {_complaint(tag, len(row))}")
+            tables[tag].add(number, row, num_ids=2 if tag == EDGE else 1)
     return tables[VERTEX], tables[EDGE], tables[FIX]
 
 
@@ -129,7 +136,7 @@ def _complaint(tag: str, num_fields: int) -> str:
     if tag in ("VERTEX_SE2", "EDGE_SE2"):
         return f"{tag} belongs to a graph in the plane; only graphs in space ({VERTEX}, {EDGE}) can be read"
     if tag not in NUM_FIELDS:
-        return f"unknown tag {brief(tag)}; known are {', '.join(NUM_FIELDS)}: remove the line"
+        return f"unknown tag {brief(tag)}; known are {', '.join(NUM_FIELDS)}: remove all lines with it"
     return f"{tag} takes {NUM_FIELDS[tag]} numbers, found {num_fields}; correct or remove the line"
 
 

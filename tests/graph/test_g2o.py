@@ -73,6 +73,11 @@ def test_empty_lines_comments_and_any_order_of_lines_are_read(tmp_path: Path) ->
     assert [(edge.a, edge.b) for edge in graph.edges] == [(0, 1), (1, 2)]
 
 
+def test_several_vertices_may_be_fixed_in_a_line_and_parameters_of_other_edges_are_ignored(tmp_path: Path) -> None:
+    lines = ["PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1", *VERTICES, *EDGES, "FIX 0 2"]
+    assert read_g2o(_file(tmp_path, lines)).fixed == (0, 2)
+
+
 def test_a_single_vertex_is_a_graph(tmp_path: Path) -> None:
     assert read_g2o(_file(tmp_path, VERTICES[:1])).edges == []
 
@@ -91,7 +96,7 @@ def test_a_single_vertex_is_a_graph(tmp_path: Path) -> None:
         (1, "VERTEX_SE3:QUAT 1 1 0 0 0 0 0 0", "quaternion's length is off by 1"),
         (1, "VERTEX_SE3:QUAT 0 1 0 0 0 0 0 1", "vertex 0 is in line 1 already"),
         (1, "VERTEX_SE2 1 1 0 0", "graph in the plane; only graphs in space"),
-        (1, "VERTEX_TRACKXYZ 1 1 0 0", "unknown tag VERTEX_TRACKXYZ; known are VERTEX_SE3:QUAT, EDGE_SE3:QUAT, FIX"),
+        (1, "VERTEX_TRACKXYZ 1 1 0 0", "VERTEX_TRACKXYZ; known are VERTEX_SE3:QUAT, EDGE_SE3:QUAT, FIX: remove all"),
         (3, EDGES[0][:-2], "takes 30 numbers, found 29"),
         (3, EDGES[0].replace("0 1 1", "0 1 inf", 1), "every number must be finite"),
         (3, EDGES[0].replace(INFORMATION, "-" + INFORMATION), "not positive definite"),

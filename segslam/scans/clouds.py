@@ -80,8 +80,10 @@ def from_columns(columns: Columns) -> Cloud:
     points = np.empty((len(axes[0]), 3), np.result_type(*map(_kind, axes)))
     for k, axis in enumerate(axes):
         points[:, k] = axis
-    intensities = next((columns[name] for name in INTENSITY_FIELDS if name in columns), None)
-    times = next((columns[name] for name in TIME_FIELDS if name in columns), np.empty(0))
+    of_cloudcompare = {name.removeprefix("scalar_").lower(): values for name, values in columns.items()}
+    named = of_cloudcompare | columns
+    intensities = next((named[name] for name in INTENSITY_FIELDS if name in named), None)
+    times = next((named[name] for name in TIME_FIELDS if name in named), np.empty(0))
     return Cloud(
         points, times.astype(np.float64), None if intensities is None else intensities.astype(_kind(intensities))
     )

@@ -196,6 +196,15 @@ def test_a_ply_without_positions_is_named(tmp_path: Path) -> None:
         scans[0]
 
 
+def test_fields_as_cloudcompare_names_them_are_read(tmp_path: Path) -> None:
+    names = "".join(f"property float {name}\n" for name in ("x", "y", "z", "scalar_Intensity", "scalar_time"))
+    header = f"ply\nformat ascii 1.0\ncomment Created by CloudCompare\nelement vertex 2\n{names}end_header\n"
+    (tmp_path / "0.ply").write_text(header + "1 2 3 0.5 0.00\n2 3 4 0.25 0.10\n")
+    scan = open_dataset(tmp_path, intensities=True)[0]
+    assert scan.intensities is not None
+    assert (scan.intensities.tolist(), scan.times.tolist()) == ([0.5, 0.25], [0.0, 1.0])
+
+
 def test_a_folder_of_scans_has_no_topics(tmp_path: Path) -> None:
     np.ones((10, 4), np.float32).tofile(tmp_path / "0.bin")
     with pytest.raises(SegslamError, match="--topic /points: only recordings have topics"):

@@ -1,6 +1,7 @@
 """Position fixes of a receiver: what their readers return and share, and the checks that need no trajectory."""
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -14,6 +15,8 @@ from segslam.gnss.geodesy import Geodetic
 
 NO_FIX, NOT_FINITE, DUPLICATE, OUTSIDE = "no_fix", "not_finite", "duplicate", "outside_run"
 """Reasons for which a fix is not used, whatever the trajectory is."""
+NMEA = re.compile(rb"\$..(GGA|RMC),")
+"""A sentence, which a receiver may send between binary messages."""
 MOST_BYTES = 2**30
 """Chosen: no log of fixes is larger than a gigabyte."""
 
@@ -104,7 +107,7 @@ def text_lines(file: Path) -> list[str]:
         content = file.read_bytes()
     except OSError as error:
         raise SegslamError(f"{unreadable(file, 'fixes', error)}; give another file with --gnss") from error
-    if b"\0" in content[:4096]:
+    if b"\0" in content[:4096] and not NMEA.search(content):
         raise SegslamError(f"{file}: a binary file; give CSV, NMEA or RTKLIB .pos, a KITTI oxts folder, or a recording")
     return content.decode("utf-8", errors="replace").lstrip("\ufeff").splitlines()
 

@@ -14,22 +14,24 @@ from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
 
 LEAST_WORDS = {"GGA": 10, "RMC": 10, "ZDA": 5}
 """Sentences that have a time, and up to which field they are read."""
+MOST_LINES = 1000
+"""Chosen: among so many lines is a sentence, even if a receiver sends binary messages (u-blox) between them."""
 
 
 def is_nmea(lines: Sequence[str]) -> bool:
     """True if one of the first lines is a sentence."""
-    return any(re.search(r"\$..(GGA|RMC|GSA|GSV|ZDA)", line) for line in lines[:50])
+    return any(re.search(r"\$..(GGA|RMC|GSA|GSV|ZDA)", line) for line in lines[:MOST_LINES])
 
 
 def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:
     """The fixes of all talkers, and a note about their heights; GGA where there is any, else RMC.
 
-    Text before the $ is ignored, such as the time of the computer. Lines with a wrong checksum are left out, and those
-    without one, unless no line has any. Raises SegslamError, naming file and line, if all are wrong, or for a
-    position with a right checksum that is none.
+    Text before the $ is ignored, such as the time of the computer or a binary message. Lines with a wrong checksum are
+    left out, and those without one, unless no line has any. Raises SegslamError, naming file and line, if all are
+    wrong, or for a position with a right checksum that is none.
     """
     found: dict[str, list[Row]] = {"GGA": [], "RMC": []}
-    contents = {number: line.partition("$")[2].strip() for number, line in enumerate(lines, 1) if "$" in line}
+    contents = {number: line.rpartition("$")[2].strip() for number, line in enumerate(lines, 1) if "$" in line}
     is_checked = any("*" in content for content in contents.values())
     all_words = {number: _words(content) if is_checked else content.split(",") for number, content in contents.items()}
     sentences = {number: words for number, words in all_words.items() if words}

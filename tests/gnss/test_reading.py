@@ -270,6 +270,15 @@ def test_bad_input_is_one_line(name: str, text: str, message: str, tmp_path: Pat
     assert "\n" not in str(raised.value)
 
 
+def test_sentences_between_the_binary_messages_of_a_receiver_are_read(tmp_path: Path) -> None:
+    """As u-blox's u-center logs them; a message may contain any byte, also that of $."""
+    rmc = sentence(f"GNRMC,023317.50,A,{_angle(PLACES[0, 0], 2)},N,{_angle(PLACES[0, 1], 3)},E,0.1,,170521,,,A")
+    sentences = [rmc, *(_gga(row, place) for row, place in enumerate(PLACES))]
+    binary = b"\xb5b\x02\x15\x00\x01" + bytes(range(256)) * 4
+    (tmp_path / "log.ubx").write_bytes(b"".join(binary + text.encode() + b"\r\n" for text in sentences))
+    np.testing.assert_allclose(read_fixes(tmp_path / "log.ubx").places, PLACES, atol=1e-6)
+
+
 def test_what_is_no_source_is_named(tmp_path: Path) -> None:
     with pytest.raises(SegslamError, match="no such file"):
         read_fixes(tmp_path / "none")

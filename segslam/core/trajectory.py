@@ -6,6 +6,7 @@ A pose file does not name its frames: the reader returns T_a_b as stored in the 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -182,6 +183,13 @@ def nanoseconds(seconds: str) -> int:
     if abs(stamp_ns) >= 2**63:
         raise ValueError(f"{brief(seconds)} s are more than 292 years")
     return stamp_ns
+
+
+def dated_nanoseconds(text: str) -> int:
+    """The stamp (ns) of a date and time in UTC, `2011-09-30 12:40:25.072360123`. Raises ValueError for another text."""
+    whole, _, fraction = text.partition(".")
+    since = datetime.fromisoformat(whole).replace(tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)
+    return (since.days * 86_400 + since.seconds) * 1_000_000_000 + int(fraction.ljust(9, "0")[:9])
 
 
 def camera_from_lidar(T_world_lidar: Poses, T_camera_lidar: Transform) -> Poses:

@@ -1,14 +1,14 @@
 """Position fixes of any source: the kind is found from the content. Messages and KITTI's oxts folder are read here."""
 
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from segslam.core.errors import brief
+from segslam.core.trajectory import dated_nanoseconds
 from segslam.core.types import SegslamError
 from segslam.core.whole_files import expanded
 from segslam.gnss.csv_fixes import read_csv
-from segslam.gnss.fixes import Fixes, Row, bad_line, check_degrees, make_fixes, number_in, stamp_of, text_lines
+from segslam.gnss.fixes import Fixes, Row, bad_line, check_degrees, make_fixes, number_in, text_lines
 from segslam.gnss.nmea import is_nmea, read_nmea
 from segslam.gnss.rtklib import is_rtklib, read_rtklib
 
@@ -88,8 +88,7 @@ def _read_oxts(folder: Path) -> list[Row]:
     rows = []
     for number, (file, text) in enumerate(zip(files, times, strict=True), 1):
         try:
-            whole, _, fraction = text.partition(".")
-            stamp_ns = stamp_of(datetime.fromisoformat(whole)) + int(fraction.ljust(9, "0")[:9] or 0)
+            stamp_ns = dated_nanoseconds(text)
         except ValueError as error:
             raise bad_line(folder / "timestamps.txt", number, f"{text[:40]} is no date and time") from error
         words = " ".join(text_lines(file)).split()

@@ -11,7 +11,7 @@ from segslam.core.config import SensorCalibrationConfig, validated
 from segslam.core.errors import brief, counted
 from segslam.core.geometry import raise_beams
 from segslam.core.points import squared_ranges
-from segslam.core.trajectory import nanoseconds
+from segslam.core.trajectory import dated_nanoseconds, nanoseconds
 from segslam.core.types import BadScan, Indices, Points, Scan, ScanLabels, SegslamError, Trajectory, Transform, Vector
 from segslam.core.whole_files import expanded, read_text
 from segslam.labels.encodings import ENCODINGS, Encoding
@@ -240,4 +240,23 @@ def read_stamps(file: Path) -> Indices:
             wrong = "is negative" if stamp_ns < 0 else f"is not later than the previous line, {before}"
             raise SegslamError(f"{file}:{number}: {brief(line)} {wrong}; times must ascend and not be negative")
         stamps.append(stamp_ns)
+    return np.array(stamps, dtype=np.int64)
+
+
+def dates_of_scans(file: Path, scans: Sequence[Path]) -> Indices:
+    """Times (ns) from a file with a date and time (UTC) per line; line n + 1 is that of the scan whose name is n.
+
+    Raises SegslamError, naming file and line.
+    """
+    lines = read_text(file, "scan times", "expected a date and time per line").split("\n")
+    stamps: list[int] = []
+    for scan in scans:
+        number = int(scan.stem) + 1 if scan.stem.isdecimal() else 0
+        if not 1 <= number <= len(lines):
+            raise SegslamError(f"{file}: has no line for {scan.name}; line n + 1 is the time of scan n")
+        try:
+            stamps.append(dated_nanoseconds(lines[number - 1].strip()))
+        except ValueError as error:
+            what = brief(lines[number - 1].strip())
+            raise SegslamError(f"{file}:{number}: {what} is no date and time; correct the line") from error
     return np.array(stamps, dtype=np.int64)

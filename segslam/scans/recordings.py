@@ -18,10 +18,21 @@ from segslam.core.trajectory import read_poses
 from segslam.core.types import BadScan, SegslamError, Trajectory
 from segslam.labels.label_files import open_labels
 from segslam.scans.clouds import SUFFIXES, read_file
-from segslam.scans.dataset import Cloud, Dataset, DataSource, check_num_lines, no_topics, read_stamps, selected_rows
+from segslam.scans.dataset import (
+    Cloud,
+    Dataset,
+    DataSource,
+    check_num_lines,
+    dates_of_scans,
+    no_topics,
+    read_stamps,
+    selected_rows,
+)
 from segslam.scans.named_stamps import stamps_of_names
 
 ASSUMED_PERIOD_NS = 100_000_000  # 10 Hz, the rate of most LiDARs; used if there are no stamps
+RAW = "velodyne_points"
+"""Folder of KITTI's raw data, and of KITTI-360, with the scans in `data/` and their dates in `timestamps.txt`."""
 KIND_OF_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "ouster"}
 REMEDIES = {
     "mcap": "; `mcap recover IN -o OUT` copies what can be read",
@@ -37,14 +48,14 @@ class Recording(Dataset):
     def __init__(self, source: DataSource) -> None:
         """Raises SegslamError, with the error of the reader, if it cannot be opened or contains no scan."""
         kind, self._source, self._loader = _opened(source)
-        place = self._source.resolve()
-        beside = place.parent if place.name == "velodyne" else self._source  # here are times, poses and labels
+        beside = _beside(self._source)
         self.name = f"{kind}/{beside.resolve().name}"
         self._has_intensities = source.intensities
         self.vertical_angle_deg = source.vertical_angle_deg or 0.0
         self.is_sequential = bool(getattr(self._loader, "is_sequential", False))
         self.num_recorded = len(self._loader)
         self._stamps = np.arange(self.num_recorded) * ASSUMED_PERIOD_NS
+        files = [self._file(index) for index in range(self.num_recorded)]
         times_file = beside / "times.txt"
         if kind == "generic" and times_file.exists():
             self._stamps = read_stamps(times_file)
@@ -52,10 +63,12 @@ class Recording(Dataset):
         elif hasattr(self._loader, "get_frames_timestamps"):
             times_s = np.asarray(self._loader.get_frames_timestamps(), dtype=float)
             self._stamps = np.rint(times_s.ravel() * 1e9).astype(np.int64)
-        elif (named := stamps_of_names([self._file(index) for index in range(self.num_recorded)])) is not None:
+        elif _is_raw(folder := files[0].parent.resolve()) and (folder.parent / "timestamps.txt").exists():
+            self._stamps = dates_of_scans(folder.parent / "timestamps.txt", files)
+        elif (named := stamps_of_names(files)) is not None:
             self._stamps = named
         self.scan_index = selected_rows(np.arange(self.num_recorded), source.frames, self._source)
-        self.names = [self._file(int(index)).stem for index in self.scan_index]
+        self.names = [files[index].stem for index in self.scan_index]
         self.labels = open_labels(source.labels, beside=beside, scan_names=self.names, encoding=source.encoding)
         poses_file = beside / "poses.txt"
         if kind == "generic" and poses_file.exists():
@@ -211,7 +224,23 @@ def _kind_of(data: Path) -> str:
 
 
 def _scans_folder(data: Path) -> Path:
-    return data / "velodyne" if not scan_files(data) and (data / "velodyne").is_dir() else data
+    """The folder itself, or that with the scans of KITTI's layouts below it."""
+    if scan_files(data):
+        return data
+    below = ["data"] if data.resolve().name == RAW else ["velodyne", f"{RAW}/data"]
+    return next((data / name for name in below if (data / name).is_dir()), data)
+
+
+def _beside(scans: Path) -> Path:
+    """The folder that has times, poses and labels of a folder of scans."""
+    place = scans.resolve()
+    if _is_raw(place):
+        return place.parent.parent
+    return place.parent if place.name == "velodyne" else scans
+
+
+def _is_raw(folder: Path) -> bool:
+    return folder.name == "data" and folder.parent.name == RAW
 
 
 def _reason(error: BaseException) -> str:

@@ -160,6 +160,34 @@ def test_courtyard_opens_with_its_stamps_and_poses(data_dir: Path) -> None:
     assert len(dataset[99].points) > 1000
 
 
+def _write_raw(folder: Path, numbers: tuple[int, ...]) -> Path:
+    """The layout of a drive of KITTI's raw data, or of KITTI-360."""
+    (folder / "velodyne_points" / "data").mkdir(parents=True)
+    for number in numbers:
+        np.full((5, 4), number + 1.0, np.float32).tofile(folder / f"velodyne_points/data/{number:010d}.bin")
+    dates = "".join(f"2011-09-30 12:40:{25 + row}.072360123\n" for row in range(4))
+    (folder / "velodyne_points" / "timestamps.txt").write_text(dates)
+    return folder
+
+
+@pytest.mark.parametrize("place", ["", "velodyne_points", "velodyne_points/data"])
+def test_a_drive_of_kittis_raw_data_has_its_dates_though_scans_are_missing(tmp_path: Path, place: str) -> None:
+    drive = _write_raw(tmp_path / "2011_09_30_drive_0016_sync", (0, 1, 3))
+    dataset = open_dataset(drive / place)
+    assert dataset.name == "generic/2011_09_30_drive_0016_sync"
+    first_ns = 1_317_386_425_072_360_123
+    assert [scan.stamp_ns - first_ns for scan in dataset] == [0, 1_000_000_000, 3_000_000_000]
+
+
+def test_dates_that_do_not_belong_to_the_scans_are_named(tmp_path: Path) -> None:
+    drive = _write_raw(tmp_path / "drive", (0, 5))
+    with pytest.raises(SegslamError, match=r"timestamps\.txt: has no line for 0000000005\.bin"):
+        open_dataset(drive)
+    (drive / "velodyne_points" / "timestamps.txt").write_text("never\n" * 6)
+    with pytest.raises(SegslamError, match=r"timestamps\.txt:1: never is no date and time; correct the line"):
+        open_dataset(drive)
+
+
 def _write_ply(file: Path, fields: str, *rows: str) -> None:
     properties = "".join(f"property float {name}\n" for name in fields)
     file.write_text(

@@ -34,7 +34,7 @@ class Cloud:
     intensities: Vector | None = None
     """(n,) in the sensor's unit; None if there are none."""
     stamp_ns: int | None = None
-    """None if the scan itself has no stamp."""
+    """None if the scan itself has no stamp, in a header or in its name."""
     logged_ns: int | None = None
     """When it was recorded, if it has no stamp."""
 

@@ -56,6 +56,7 @@ class Recording(Dataset):
         self.num_recorded = len(self._loader)
         self._stamps = np.arange(self.num_recorded) * ASSUMED_PERIOD_NS
         files = [self._file(index) for index in range(self.num_recorded)]
+        self._has_named_stamps = False
         times_file = beside / "times.txt"
         if kind == "generic" and times_file.exists():
             self._stamps = read_stamps(times_file)
@@ -66,7 +67,7 @@ class Recording(Dataset):
         elif _is_raw(folder := files[0].parent.resolve()) and (folder.parent / "timestamps.txt").exists():
             self._stamps = dates_of_scans(folder.parent / "timestamps.txt", files)
         elif (named := stamps_of_names(files)) is not None:
-            self._stamps = named
+            self._stamps, self._has_named_stamps = named, True
         self.scan_index = selected_rows(np.arange(self.num_recorded), source.frames, self._source)
         self.names = [files[index].stem for index in self.scan_index]
         self.labels = open_labels(source.labels, beside=beside, scan_names=self.names, encoding=source.encoding)
@@ -98,6 +99,8 @@ class Recording(Dataset):
             fits = item.intensities is not None and len(item.intensities) == len(points)
             times = np.asarray(item.times, dtype=np.float64).ravel()
             cloud = replace(item, points=points, times=times, intensities=item.intensities if fits else None)
+            if self._has_named_stamps:
+                cloud = replace(cloud, stamp_ns=int(self._stamps[index]))
         except BadScan:
             raise
         except FOREIGN_ERRORS as error:

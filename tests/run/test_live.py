@@ -141,9 +141,10 @@ def test_the_times_of_the_points_of_a_file_are_used_as_when_it_is_mapped_later(t
     finally:
         stopped.set()
     assert arrival is not None
-    times = arrival.read(0, arrival.stamp_ns).times
-    np.testing.assert_allclose(times, [0.0, 0.25, 0.5, 0.75, 1.0], atol=1e-6)
-    np.testing.assert_array_equal(times, open_dataset(tmp_path)[0].times)
+    scan, later = arrival.read(0, arrival.stamp_ns), open_dataset(tmp_path)[0]
+    np.testing.assert_allclose(scan.times, [0.0, 0.25, 0.5, 0.75, 1.0], atol=1e-6)
+    np.testing.assert_array_equal(scan.times, later.times)
+    assert scan.stamp_time == later.stamp_time == 0.0  # they count from the stamp in the name
 
 
 def test_a_file_that_is_no_scan_is_a_bad_scan(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import struct
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from multiprocessing.sharedctypes import RawValue
 from pathlib import Path
 from threading import Event
@@ -122,7 +123,7 @@ class FolderSource(Source):
     def _read(self, file: Path, index: int, stamp_ns: int, content: tuple[int, int]) -> Scan:
         """The scan of a file. Raises BadScan, also if the file has another content than when it was put."""
         try:
-            cloud = read_file(file)
+            cloud = replace(read_file(file), stamp_ns=stamp_of_name(file.stem))
         except SegslamError as error:
             raise BadScan(str(error)) from error
         scan = self._scan(file, index, stamp_ns, cloud)

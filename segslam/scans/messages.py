@@ -123,7 +123,11 @@ class BagMessages:
 
     def _messages(self) -> Iterator[tuple[int, bytes, str]]:
         # of no connections, rosbags gives all messages
-        streams = [reader.messages(connections=known) for reader, known in self._connections.items() if known]
+        streams = [
+            reader.messages(connections=_as_stored(reader, known))
+            for reader, known in self._connections.items()
+            if known
+        ]
         for connection, log_ns, data in heapq.merge(*streams, key=itemgetter(1)):
             yield log_ns, data, connection.msgtype
 
@@ -214,6 +218,24 @@ def one_topic(recording: Path, known: Collection[str], wanted: str, *, kinds: Se
         topics = ", ".join(f"{option} {name}" for name in sorted(known)) or "none"
         raise SegslamError(f"{recording}: give one topic of type {' or '.join(kinds)}; the recording has: {topics}")
     return found[0]
+
+
+def _as_stored(reader: Any, connections: list[Any]) -> list[Any]:
+    """The connections of a folder of ROS 2 as its files describe them, by topic and type.
+
+    rosbags gives no messages of a connection whose quality of service in metadata.yaml is not that in the file, though
+    programs change one of the two.
+    """
+    stored = [
+        one for storage in getattr(getattr(reader, "storage", None), "storages", ()) for one in storage.connections
+    ]
+    described = [
+        one._replace(ext=other.ext, digest="")
+        for one in connections
+        for other in stored
+        if (one.topic, one.msgtype) == (other.topic, other.msgtype)
+    ]
+    return described or connections
 
 
 def _close(bag: Any) -> None:

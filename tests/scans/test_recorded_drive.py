@@ -1,5 +1,6 @@
 """Recordings made by others' writers, from the file to the map."""
 
+import re
 import sqlite3
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,7 @@ from helpers.other_recordings import (
     write_mcap_of_ros1,
 )
 from helpers.recorded_drive import (
+    CLOUD,
     FIRST_STAMP_NS,
     OTHER_TOPIC,
     SWEEP_NS,
@@ -91,6 +93,24 @@ def test_a_message_of_livox_that_is_cut_short_is_a_bad_scan(tmp_path: Path) -> N
                 dataset[1]
             assert len(list(dataset)) == 2
     database.close()
+
+
+def test_a_bag_whose_metadata_another_program_has_changed_is_read(tmp_path: Path) -> None:
+    """The quality of service is then not that in the file, as after a conversion of Jazzy's metadata for Humble."""
+    folder = write_bag2(tmp_path / "drive", tuple((10**9 * row, np.ones(5, CLOUD)) for row in (1, 2, 3)))
+    unlimited = "{sec: 2147483647, nsec: 4294967295}"
+    quality = ", ".join(
+        [
+            *("history: 3", "depth: 0", "reliability: 1", "durability: 2", "liveliness: 1"),
+            *(f"{name}: {unlimited}" for name in ("deadline", "lifespan", "liveliness_lease_duration")),
+            "avoid_ros_namespace_conventions: false",
+        ]
+    )
+    metadata = (folder / "metadata.yaml").read_text()
+    changed = metadata.replace("offered_qos_profiles: ''", f"offered_qos_profiles: '[{{{quality}}}]'")
+    assert changed != metadata
+    (folder / "metadata.yaml").write_text(re.sub(r"RIHS01_\w+", f"RIHS01_{64 * '0'}", changed))
+    assert len(list(open_dataset(folder))) == 3
 
 
 @pytest.mark.parametrize("has_stamps", [True, False])

@@ -8,13 +8,12 @@ it is a header: the names of as many columns as the first fix has.
 import re
 from collections.abc import Mapping, Sequence
 from datetime import datetime
-from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 
 from segslam.core.errors import brief
-from segslam.core.trajectory import LATEST_S
+from segslam.core.trajectory import nanoseconds
 from segslam.core.types import SegslamError
 from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
 
@@ -119,18 +118,14 @@ def _row(file: Path, number: int, cells: Sequence[str], places: dict[str, int]) 
 
 
 def _stamp(file: Path, number: int, text: str, *, is_ns: bool) -> int:
-    """Time in ns of a number, in ns or the unit that its size shows (LATEST_S), or of a date in ISO 8601."""
+    """Time in ns of a number, in ns or as `nanoseconds` understands it, or of a date in ISO 8601."""
     text = text.strip()
     try:
         if re.match(r"\d{4}-\d\d-\d\d", text):
             text, is_leap = re.subn(r"(\d\d:\d\d):60", r"\1:59", text, count=1)  # the second after 59
             return stamp_of(datetime.fromisoformat(text.replace("Z", "+00:00"))) + is_leap * 10**9
-        if is_ns:
-            return int(text)
-        value = Decimal(text)
-        steps = next(steps for steps in range(4) if abs(value) < LATEST_S * 1000**steps)  # s, ms, us, ns
-        return int((value * 1000 ** (3 - steps)).to_integral_value())
-    except (ArithmeticError, ValueError, OverflowError, StopIteration) as error:
+        return int(text) if is_ns else nanoseconds(text)
+    except (ValueError, OverflowError) as error:
         what = f"time {brief(text, 40)} is neither a number of seconds nor a date as 2026-01-31T12:00:00Z"
         raise bad_line(file, number, what) from error
 

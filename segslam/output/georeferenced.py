@@ -18,7 +18,7 @@ from segslam.core.types import SegslamError
 from segslam.core.whole_files import expanded, unless_damaged, whole_file, write_whole
 from segslam.gnss import Drive, Fixes, Georeference, Origin, Use, geodetic_from_enu, utm_epsg
 from segslam.gnss import georeference as georeference_drive
-from segslam.gnss.fixes import DUPLICATE, NO_FIX, NOT_FINITE, Row
+from segslam.gnss.fixes import DUPLICATE, NO_FIX, NOT_FINITE, OUTSIDE, Row
 from segslam.gnss.geodesy import Geodetic
 from segslam.gnss.reading import read_fixes
 from segslam.graph.g2o import read_g2o
@@ -33,6 +33,8 @@ FILE, FIXES, GEODETIC, ENU = PLACE_FILES
 PLACE = ("datum", "latitude_deg", "longitude_deg", "height_m", "epsg", "T_enu_map", "sigma")
 """What a run localised in the map takes over from `FILE`."""
 SIGMAS = ("east_m", "north_m", "up_m")
+UNUSED = (NO_FIX, NOT_FINITE, DUPLICATE, OUTSIDE)
+"""Reasons of fixes that a merged run does not use: those outside the drive may be at the time of another session."""
 DEGREES_AND_HEIGHT = ("latitude_deg", "longitude_deg", "height_m")
 not_damaged = partial(unless_damaged, remedy="run `segslam georeference` again")
 
@@ -133,7 +135,7 @@ def take_over(run: str | Path, map_run: str | Path) -> bool:
 def recorded_fixes(folder: Path, *, stamp_shift_ns: int = 0) -> tuple[list[Row], str]:
     """The fixes of a run, in the clock of its scans, shifted, and how they were used; without fixes, both are empty.
 
-    Raises SegslamError for damaged files.
+    Without `UNUSED` ones. Raises SegslamError for damaged files.
     """
     file = folder / FIXES
     if not file.exists():
@@ -142,7 +144,7 @@ def recorded_fixes(folder: Path, *, stamp_shift_ns: int = 0) -> tuple[list[Row],
         values = json.loads((folder / FILE).read_text(encoding="utf-8"))
         offset_ns = round(1e9 * (values["given_offset_s"] + values["clock_offset_s"])) + stamp_shift_ns
         with file.open(newline="", encoding="utf-8") as stream:
-            rows = [row for row in csv.DictReader(stream) if row["reason"] not in (NO_FIX, NOT_FINITE, DUPLICATE)]
+            rows = [row for row in csv.DictReader(stream) if row["reason"] not in UNUSED]
         found = []
         for row in rows:
             latitude, longitude, height_m = (float(row[name] or "nan") for name in DEGREES_AND_HEIGHT)

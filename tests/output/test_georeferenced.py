@@ -27,7 +27,7 @@ from segslam.gnss import Origin, enu_from_geodetic, geodetic_from_enu
 from segslam.gnss.geodesy import utm
 from segslam.output.export import export, track
 from segslam.output.folder import write_localised
-from segslam.output.georeferenced import Globe, georeference, read_globe, take_over
+from segslam.output.georeferenced import Globe, georeference, read_globe, recorded_fixes, take_over
 from segslam.output.log import read_log, schema
 from segslam.output.log.locations import write_locations
 from segslam.output.map.picture import _affine
@@ -48,6 +48,16 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> MadeRun:
     write_fixes(root / "fixes.csv", trajectory.stamp_ns, trajectory.T_world_lidar)
     assert run("georeference", found.folder, "--gnss", root / "fixes.csv", "--quiet") == 0
     return found
+
+
+def test_fixes_outside_a_drive_are_not_passed_on_to_a_merged_run(made: MadeRun, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(made.folder, tmp_path / "run"))
+    known, _ = recorded_fixes(folder)
+    *rows, last = (folder / "gnss.csv").read_text().splitlines()
+    assert last.endswith(",1,")
+    (folder / "gnss.csv").write_text("\n".join([*rows, last.removesuffix("1,") + "0,outside_run"]) + "\n")
+    fixes, _ = recorded_fixes(folder)
+    assert fixes == known[:-1]
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ import hashlib
 import json
 import re
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,8 @@ from segslam.output.log import read_log
 from segslam.output.map import picture
 from segslam.output.report import comparison, figures
 from segslam.output.report.loops import top_view
-from segslam.run.sessions.recorded import Part, figures_of
+from segslam.run.sessions.merge import arranged
+from segslam.run.sessions.recorded import Part, SessionPose, figures_of, read_sessions
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("short_runs")]
 
@@ -138,6 +139,24 @@ def test_scans_and_stamps_of_the_second_session_follow_the_first(days: Days, mer
     assert shift["stamp_shift_ns"] == whole.stamp_ns[-1] - second.stamp_ns[-1]
     states = [motion.state for motion in merged.result.motions]
     assert states.index(MotionState.BEGUN) == len(first)
+
+
+def test_true_poses_after_the_last_scan_of_a_session_are_not_those_of_the_next(days: Days) -> None:
+    monday, friday = read_sessions([days.monday.folder, days.friday.folder])
+    assert monday.run.reference is not None
+    truth = monday.run.reference
+    longer = Trajectory(
+        np.append(truth.scan_index, np.arange(22, 27)),
+        np.append(truth.stamp_ns, truth.stamp_ns[-1] + 100_000_000 * np.arange(1, 6)),
+        np.append(truth.T_world_lidar, truth.T_world_lidar[:5], axis=0),
+    )
+    stopped = replace(monday, run=replace(monday.run, reference=longer))
+    poses = [None, SessionPose(0, np.eye(4), ())]
+    whole, early = (arranged([one, friday], poses, same_reference=True).reference for one in (monday, stopped))
+    assert whole is not None
+    assert early is not None
+    np.testing.assert_array_equal(early.scan_index, whole.scan_index)
+    np.testing.assert_array_equal(early.T_world_lidar, whole.T_world_lidar)
 
 
 @pytest.fixture(scope="module")

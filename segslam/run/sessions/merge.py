@@ -225,14 +225,21 @@ def _placed(sessions: Sequence[Session], session_poses: Sequence[SessionPose | N
 
 
 def _reference(sessions: Sequence[Session], same_reference: bool) -> Trajectory | None:
-    """The true poses of all sessions by new scan numbers; None if a session has none, or another frame."""
+    """The true poses of all sessions by new scan numbers; None if a session has none, or another frame.
+
+    Without those after the last mapped scan of a session, whose numbers are those of the next session.
+    """
     sequences = {(one.run.options.get("data"), one.run.options.get("sequence")) for one in sessions}
     is_one_sequence = len(sequences) == 1 and sequences != {(None, None)}
-    known = [(one.run.reference, one.shift) for one in sessions if one.run.reference is not None]
+    known = [
+        (truth, truth.scan_index <= one.run.result.trajectory.scan_index[-1], one.shift)
+        for one in sessions
+        if (truth := one.run.reference) is not None
+    ]
     if not (same_reference or is_one_sequence) or len(known) < len(sessions):
         return None
     return Trajectory(
-        np.concatenate([one.scan_index + shift.scan_index for one, shift in known]),
-        np.concatenate([one.stamp_ns + shift.stamp_ns for one, shift in known]),
-        np.concatenate([one.T_world_lidar for one, _ in known]),
+        np.concatenate([truth.scan_index[rows] + shift.scan_index for truth, rows, shift in known]),
+        np.concatenate([truth.stamp_ns[rows] + shift.stamp_ns for truth, rows, shift in known]),
+        np.concatenate([truth.T_world_lidar[rows] for truth, rows, _ in known]),
     )

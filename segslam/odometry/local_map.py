@@ -166,21 +166,21 @@ class LocalMap:
         found = refinement.refine(scan.surface, self.surface(), T_map_guess, config=self._config, must_converge=False)
         if not isinstance(found, Registration):
             return []
-        pose = self._nudged(scan, found.T_target_source, POLISH_VOXELS, NUM_POINTS)
-        return [] if pose is None else [self.fit(scan, pose)]
+        polished = self._nudged(scan, found.T_target_source, POLISH_VOXELS, NUM_POINTS)
+        return [] if polished is None else [polished]
 
     def approach(self, scan: SeenScan, T_map_guess: Transform) -> Fit | None:
         """The pose to which robust steps with few points lead from a guess; None if too few points are near the map."""
-        found = self._nudged(scan, T_map_guess, SEARCH_VOXELS, NUM_SEARCH)
-        return None if found is None else self.fit(scan, found)
+        return self._nudged(scan, T_map_guess, SEARCH_VOXELS, NUM_SEARCH)
 
     def fit(self, scan: SeenScan, T_map_lidar: Transform) -> Fit:
         """The likelihood of the scan at this pose."""
         surface = self.surface()
         return fit(scan.surface.points, surface, T_map_lidar, voxel_m=self.voxel_m, sigma_m=surface.roughness_m)
 
-    def _nudged(
-        self, scan: SeenScan, T_map_guess: Transform, reaches: Sequence[float], num_points: int
-    ) -> Transform | None:
+    def _nudged(self, scan: SeenScan, T_map_guess: Transform, reaches: Sequence[float], num_points: int) -> Fit | None:
+        """None also if a step leads away from the map: along a single plane, which does not constrain it."""
         source, target = scan.surface.points, self.surface()
-        return nudge(source, target, T_map_guess, voxel_m=self.voxel_m, reaches=reaches, num_points=num_points)
+        found = nudge(source, target, T_map_guess, voxel_m=self.voxel_m, reaches=reaches, num_points=num_points)
+        fit = None if found is None else self.fit(scan, found)
+        return None if fit is None or fit.overlap == 0.0 else fit

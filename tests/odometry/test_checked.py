@@ -18,6 +18,7 @@ from segslam.core.types import Motion, MotionState, Registration, Rejected, Reje
 from segslam.graph.graph import BREAK_LENGTH_M
 from segslam.graph.noise import odometry_information
 from segslam.labels.label_files import unlabelled
+from segslam.odometry import local_map
 from segslam.odometry.checked import CheckedOdometry, Proposed
 from segslam.odometry.kiss import KissOdometry
 from segslam.odometry.likelihood import Fit, fit
@@ -553,6 +554,18 @@ def test_a_narrow_view_of_new_surroundings_does_not_slide_back_along_a_wall(data
     found = search.around(T_map_last, step, near)
     assert geometry.distance(geometry.inverse(T_map_lidar) @ found[0].T_map_lidar) < 0.3
     assert max(found, key=lambda fit: fit.mean_log) is not found[0], "by the likelihood alone, another"
+
+
+def test_a_pose_at_which_no_point_is_near_the_map_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A map of one plane constrains no step along it: steps of hundreds of metres were seen in real scans."""
+    local = LocalMap(CONFIG.refine)
+    scan = SeenScan(round_drive()[0][0].points, CONFIG.refine)
+    local.add(np.eye(4), scan)
+    assert local.approach(scan, np.eye(4)) is not None
+    far = geometry.transform(np.eye(3), [180.0, 0.0, 0.0])
+    monkeypatch.setattr(local_map, "nudge", lambda *_, **__: far)
+    assert local.register(scan, np.eye(4)) == []
+    assert local.approach(scan, np.eye(4)) is None
 
 
 def test_points_on_the_borders_of_voxels_are_in_the_same_ones_for_poses_that_differ_by_rounding() -> None:

@@ -52,7 +52,7 @@ class OdometryApart(KissOdometry):
             T_discarded, self._foreseen = self._apart.begun(), None
             if self._keeps_alone and not self._has_followed:  # KISS-ICP alone has aligned the next scan with this
                 self._apart.keep(T_discarded)
-                self._is_alone_known = True
+                self._T_sweep_alone = self._T_last_lidar
         super().follow(scans, T_odom_lidar, T_before_lidar)
 
     def _aligned(self, scan: Scan, gap: float) -> tuple[Swept, Transform]:

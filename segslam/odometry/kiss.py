@@ -25,8 +25,10 @@ class KissOdometry:
         self._config = config
         self._aligner = aligner or KissAligner(kiss_config(config))
         self._keeps_alone, self._has_followed = keeps_alone, False
-        self._is_alone_known = False
-        """True if the pose of the next scan by KISS-ICP alone is kept already."""
+        self._T_sweep_alone: Transform | None = None
+        """Motion during the sweep of the next scan, if its pose by KISS-ICP alone is kept already."""
+        self._T_end_stamp: list[Transform] = []
+        """Pose of the sensor at the stamp of each scan of `alone`, in that at the end of its sweep."""
         self._last_gap = 1.0
         self._T_odom_last = self._T_last_lidar = np.eye(4)
 
@@ -55,22 +57,26 @@ class KissOdometry:
         self._T_odom_last, self._T_last_lidar = T_odom_lidar, T_before_lidar
 
     def alone(self) -> list[Transform]:
-        """The pose of each scan by KISS-ICP alone, without corrections by `follow`; empty if they are not kept."""
-        return self._aligner.alone()
+        """The pose at the stamp of each scan by KISS-ICP alone, without corrections by `follow`; empty if not kept."""
+        ends = self._aligner.alone()  # perhaps with that of the next scan
+        return [T_odom_end @ T_end for T_odom_end, T_end in zip(ends, self._T_end_stamp, strict=False)]
 
     def _register_alone(self, scan: Scan, points: Points, T_odom_lidar: Transform, gap: float) -> None:
         """Keep the pose by KISS-ICP alone; `points` and the pose are those of the scan here."""
         if not self._has_followed:
+            T_sweep = self._T_last_lidar
             self._aligner.keep(T_odom_lidar)
-        elif self._is_alone_known:
-            self._is_alone_known = False
+        elif self._T_sweep_alone is not None:
+            T_sweep, self._T_sweep_alone = self._T_sweep_alone, None
         else:
-            before, last = [np.eye(4), np.eye(4), *self.alone()[-2:]][-2:]
-            T_last_lidar = geometry.scaled(_since(before, last), 1 / self._last_gap)
+            before, last = [np.eye(4), np.eye(4), *self._aligner.alone()[-2:]][-2:]
+            T_sweep = geometry.scaled(_since(before, last), 1 / self._last_gap)
             with suppress(BadScan):
-                points = deskew_scan(scan, T_last_lidar, self._config)[0]
-            self._aligner.align_alone(points, geometry.scaled(T_last_lidar, gap))
+                points = deskew_scan(scan, T_sweep, self._config)[0]
+            self._aligner.align_alone(points, geometry.scaled(T_sweep, gap))
         self._last_gap = gap
+        share = 1.0 - scan.stamp_time if is_swept(scan, self._config) else 0.0
+        self._T_end_stamp.append(geometry.inverse(geometry.scaled(T_sweep, share)))
 
 
 def _since(T_odom_last: Transform, T_odom_lidar: Transform) -> Transform:

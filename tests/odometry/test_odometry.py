@@ -4,6 +4,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -126,6 +127,21 @@ def test_the_poses_of_kiss_icp_alone_are_kept_while_the_odometry_follows_others(
             np.testing.assert_allclose(odometry.alone(), expected, atol=1e-9)
     np.testing.assert_allclose(odometry.alone(), expected, atol=1e-9)
     assert geometry.distance(geometry.inverse(found[-1].T_odom_lidar) @ expected[-1]) > 0.1
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_the_poses_of_kiss_icp_alone_are_those_at_the_stamps(apart: bool) -> None:
+    sweeps = [replace(scan, times=np.linspace(0.0, 1.0, len(scan.points))) for scan in _street(7)]
+    ends, starts = [], []
+    for stamp_time, found in ((1.0, ends), (0.0, starts)):
+        with _keeping_alone(apart=apart) as odometry:
+            _followed(odometry, [replace(scan, stamp_time=stamp_time) for scan in sweeps], foresees=apart)
+            found += odometry.alone()
+    before = [np.eye(4), np.eye(4), *ends]
+    motions = [geometry.inverse(one) @ other for one, other in pairwise(before)][: len(ends)]
+    expected = [T_odom_end @ geometry.inverse(motion) for T_odom_end, motion in zip(ends, motions, strict=True)]
+    assert geometry.distance(motions[-1]) > 0.1
+    np.testing.assert_allclose(starts, expected, atol=1e-9)
 
 
 def _followed(odometry: KissOdometry, scans: list[Scan], *, foresees: bool) -> list[np.ndarray]:

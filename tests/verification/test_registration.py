@@ -89,6 +89,22 @@ def test_a_gate_sees_the_refined_pose_too_which_moves_no_farther() -> None:
     assert error_m[slack_m.index(0.0)] < 0.05
 
 
+def test_a_pose_ends_the_search_only_if_it_is_probable_and_the_prior_allows_it() -> None:
+    source, target, T_target_source = _round_pair()
+    no = Rejected(RejectReason.FAR_FROM_PRIOR)
+    free, excluding = (
+        Trial(source, target, CONFIG, gate, Stopwatch())
+        for gate in (anywhere, lambda pose, *, slack_m: no if slack_m == 0.0 else None)
+    )
+    coarse = Registration(T_target_source, 3, 3, 0.1, np.eye(6))
+    right = free.found(coarse, coarse)
+    T_off = T_target_source @ geometry.transform(np.eye(3), np.array([0.0, 1.5, 0.0]))
+    wrong = free.found(coarse, replace(coarse, T_target_source=T_off))
+    assert free.fits(right)
+    assert not free.fits(wrong)
+    assert not excluding.fits(right)
+
+
 def test_poses_that_the_prior_excludes_do_not_use_up_the_attempts(monkeypatch: pytest.MonkeyPatch) -> None:
     """As in a corridor, where the poses that fit best are turned round."""
     source, target, T_target_source = _round_pair()

@@ -747,6 +747,15 @@ def test_a_motion_is_as_uncertain_in_each_direction_as_the_scan_or_the_model_whi
     np.testing.assert_allclose(eigh(np.linalg.inv(own), model, eigvals_only=True), [1.0] * 4 + [4.0, 9.0], rtol=1e-6)
 
 
+def test_a_scan_that_shows_nothing_in_a_direction_is_as_unsure_there_as_one_that_nothing_explains() -> None:
+    odometry = _checked(round_drive()[1].T_world_lidar)
+    information = np.diag([0.0, 1e6, 1e6, 0.0, 1e6, 1e6])
+    covariance = odometry._covariance(Fit(np.eye(4), 0.0, 100, 1.0, 0.05, information))
+    sigma = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(sigma[[0, 3]], [np.radians(60.0), 30.0], rtol=1e-3)
+    assert (sigma[[1, 2, 4, 5]] < 0.04).all()
+
+
 @pytest.mark.parametrize("state", [MotionState.CONFIRMED, MotionState.REFINED])
 def test_a_pose_that_is_kept_is_unsure_by_its_distance_from_the_registered_one(state: MotionState) -> None:
     odometry = _checked(round_drive()[1].T_world_lidar)

@@ -14,7 +14,8 @@ from helpers.drives import round_drive, write_kitti_sequence
 from helpers.finished_run import MadeRun, make_run
 
 import segslam
-from segslam.core.trajectory import camera_from_lidar, read_poses, write_kitti, write_tum
+from segslam.core.pose_files import read_poses, write_kitti, write_tum
+from segslam.core.trajectory import camera_from_lidar
 from segslam.output.finished import FinishedRun
 
 

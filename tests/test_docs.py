@@ -24,7 +24,7 @@ import segslam
 from segslam import cli
 from segslam.cli import commands
 from segslam.core.config import Config
-from segslam.core.trajectory import read_poses
+from segslam.core.pose_files import read_poses
 from segslam.core.types import RejectReason
 from segslam.output.log import schema
 from segslam.scans import open_dataset

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from segslam.core.evaluation import UP, trajectory_metrics, upward_axis
-from segslam.core.trajectory import read_poses
+from segslam.core.pose_files import read_poses
 
 if len(sys.argv) != 3:
     sys.exit(__doc__)

@@ -163,7 +163,7 @@ def _score_files(
     estimate_file: Path, reference_file: Path, how: Scoring, plot: Path | None, terminal: Terminal
 ) -> dict[str, Any]:
     from segslam.core.evaluation import UP, upward_axis
-    from segslam.core.trajectory import read_poses
+    from segslam.core.pose_files import read_poses
     from segslam.output.accuracy import scores
     from segslam.run.evaluate import matched_poses
 

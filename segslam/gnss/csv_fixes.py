@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from segslam.core.errors import brief
-from segslam.core.trajectory import nanoseconds
+from segslam.core.pose_files import nanoseconds
 from segslam.core.types import SegslamError
 from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
 

@@ -5,15 +5,8 @@ from pathlib import Path
 from typing import Literal
 
 from segslam.core.errors import SegslamError
-from segslam.core.trajectory import (
-    PoseFile,
-    Poses,
-    camera_from_lidar,
-    lidar_from_camera,
-    read_poses,
-    write_kitti,
-    write_tum,
-)
+from segslam.core.pose_files import PoseFile, read_poses, write_kitti, write_tum
+from segslam.core.trajectory import Poses, camera_from_lidar, lidar_from_camera
 from segslam.core.types import Indices
 from segslam.core.whole_files import whole_file
 from segslam.scans.dataset import read_stamps

@@ -10,7 +10,8 @@ import numpy as np
 
 from segslam.core.config import Config
 from segslam.core.errors import counted, unreadable
-from segslam.core.trajectory import PoseFormat, lidar_from_camera, read_poses, rows_of_same_stamp
+from segslam.core.pose_files import PoseFormat, read_poses
+from segslam.core.trajectory import lidar_from_camera, rows_of_same_stamp
 from segslam.core.types import LoopAttempt, Motion, SegslamError, Trajectory, Transform
 from segslam.core.whole_files import expanded
 from segslam.output.folder import ALONE, LOG, folder_of, read_alone, read_localised

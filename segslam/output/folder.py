@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from segslam.core.errors import how_to_write, reason
-from segslam.core.trajectory import camera_from_lidar, read_poses, write_kitti, write_tum
+from segslam.core.pose_files import read_poses, write_kitti, write_tum
+from segslam.core.trajectory import camera_from_lidar
 from segslam.core.types import (
     Alignment,
     LoopAttempt,

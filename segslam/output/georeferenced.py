@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from segslam.core.trajectory import Poses, corrected_poses, read_poses, write_tum
+from segslam.core.pose_files import read_poses, write_tum
+from segslam.core.trajectory import Poses, corrected_poses
 from segslam.core.types import SegslamError
 from segslam.core.whole_files import expanded, unless_damaged, whole_file, write_whole
 from segslam.gnss import Drive, Fixes, Georeference, Origin, Use, geodetic_from_enu, utm_epsg

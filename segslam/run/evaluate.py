@@ -6,7 +6,8 @@ from typing import get_args
 import numpy as np
 
 from segslam.core.evaluation import Z_UP
-from segslam.core.trajectory import PoseFile, Poses, as_poses, read_poses, rows_of_same_scan, rows_of_same_stamp
+from segslam.core.pose_files import PoseFile, read_poses
+from segslam.core.trajectory import Poses, as_poses, rows_of_same_scan, rows_of_same_stamp
 from segslam.core.types import SegslamError, Trajectory
 from segslam.core.whole_files import expanded
 from segslam.output.accuracy import Align, scores

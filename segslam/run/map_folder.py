@@ -11,7 +11,7 @@ import numpy as np
 
 from segslam.core.config import Config, OdometryConfig, check_config
 from segslam.core.errors import brief
-from segslam.core.trajectory import read_poses
+from segslam.core.pose_files import read_poses
 from segslam.core.types import BadScan, SegslamError, Step, Trajectory
 from segslam.core.whole_files import expanded
 from segslam.labels.encodings import Encoding

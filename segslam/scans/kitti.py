@@ -13,7 +13,8 @@ from jaxtyping import Float32
 
 from segslam.core import geometry
 from segslam.core.errors import brief
-from segslam.core.trajectory import ROTATION_TOLERANCE, lidar_from_camera, read_poses
+from segslam.core.pose_files import read_poses
+from segslam.core.trajectory import ROTATION_TOLERANCE, lidar_from_camera
 from segslam.core.types import BadScan, Indices, SegslamError, Trajectory, Transform
 from segslam.core.whole_files import read_text
 from segslam.labels.label_files import open_labels

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from segslam.core.errors import brief
-from segslam.core.trajectory import read_poses
+from segslam.core.pose_files import read_poses
 from segslam.core.types import BadScan, SegslamError, Trajectory
 from segslam.labels.label_files import open_labels
 from segslam.scans.clouds import SUFFIXES, read_file

@@ -8,16 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from segslam.core.evaluation import align_positions, trajectory_metrics
-from segslam.core.trajectory import (
-    Poses,
-    as_poses,
-    begun_among,
-    camera_from_lidar,
-    parted,
-    rows_of_same_scan,
-    write_kitti,
-    write_tum,
-)
+from segslam.core.pose_files import write_kitti, write_tum
+from segslam.core.trajectory import Poses, as_poses, begun_among, camera_from_lidar, parted, rows_of_same_scan
 from segslam.core.types import (
     GraphEstimate,
     Indices,

@@ -10,7 +10,7 @@ from segslam.bench.simulation.sensor import drive_sweeps
 from segslam.bench.simulation.tracks import NOMINAL_CALIB, Drive, example_drive, in_lane, read_drive
 from segslam.bench.simulation.world import World
 from segslam.bench.simulation.world_settings import SensorConfig, SimulationConfig, WorldConfig
-from segslam.core.trajectory import read_poses, write_kitti
+from segslam.core.pose_files import read_poses, write_kitti
 from segslam.core.types import Label, SegslamError
 from segslam.labels.encodings import RAW_OF_LABEL
 from segslam.scans import open_dataset

@@ -11,7 +11,7 @@ from helpers.drives import write_kitti_sequence
 from helpers.yards import seen
 
 from segslam.core import geometry
-from segslam.core.trajectory import write_kitti
+from segslam.core.pose_files import write_kitti
 from segslam.core.types import Trajectory
 from segslam.odometry.sweep import GivenOdometry
 from segslam.output.log import read_log

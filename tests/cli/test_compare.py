@@ -11,7 +11,7 @@ from matplotlib.image import imread
 
 from segslam.cli import doctor
 from segslam.core import extras
-from segslam.core.trajectory import write_kitti
+from segslam.core.pose_files import write_kitti
 from segslam.output.finished import read_run
 from segslam.output.folder import write_metrics
 from segslam.output.report.comparison import by_data, draw_runs

@@ -10,7 +10,8 @@ from helpers.made_logs import largest_file
 
 from segslam import cli
 from segslam.core.evaluation import trajectory_metrics
-from segslam.core.trajectory import camera_from_lidar, read_poses, write_kitti, write_tum
+from segslam.core.pose_files import read_poses, write_kitti, write_tum
+from segslam.core.trajectory import camera_from_lidar
 from segslam.output.accuracy import scores
 
 

@@ -11,7 +11,7 @@ from helpers.drives import drifting, round_drive
 from helpers.finished_run import make_run
 
 from segslam.cli.tables import as_text
-from segslam.core.trajectory import write_kitti
+from segslam.core.pose_files import write_kitti
 from segslam.output.accuracy import scores
 from segslam.output.report import figures
 from segslam.output.words import COLUMNS

@@ -12,7 +12,8 @@ from helpers.drives import round_drive, write_kitti_sequence
 from segslam import map_folder
 from segslam.core.config import OdometryConfig
 from segslam.core.errors import SegslamError
-from segslam.core.trajectory import read_poses, travelled_m, write_kitti
+from segslam.core.pose_files import read_poses, write_kitti
+from segslam.core.trajectory import travelled_m
 from segslam.output.log import read_log
 
 RUN_FILES = {

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from segslam import cli
-from segslam.core.trajectory import write_kitti
+from segslam.core.pose_files import write_kitti
 from segslam.scans import open_dataset
 
 

@@ -23,7 +23,7 @@ from segslam.core.evaluation import (
     trajectory_metrics,
     upward_axis,
 )
-from segslam.core.trajectory import read_poses
+from segslam.core.pose_files import read_poses
 
 REAL = [  # camera frame or ground-truth frame: each is scored against the official poses as it is
     ("KITTI_00_ORB", "00", 1.30),

@@ -15,7 +15,7 @@ from fuzz import own_log, seeds
 from fuzz.mutation import mutate
 from fuzz.rewriting import rewritten
 from segslam.core.config import load_config
-from segslam.core.trajectory import read_poses
+from segslam.core.pose_files import read_poses
 from segslam.core.types import BadScan, SegslamError
 from segslam.gnss.reading import read_fixes
 from segslam.graph.batch import Robust, optimize_graph

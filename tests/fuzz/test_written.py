@@ -10,7 +10,7 @@ from hypothesis import assume, given, settings
 
 from fuzz import seeds
 from segslam.core.config import Config, config_to_yaml, load_config
-from segslam.core.trajectory import read_poses, write_kitti, write_tum
+from segslam.core.pose_files import read_poses, write_kitti, write_tum
 from segslam.scans.clouds import read_file
 from segslam.scans.dataset import read_stamps
 from segslam.scans.pcd import decompress

@@ -14,7 +14,8 @@ from segslam.bench.simulation.world import World
 from segslam.bench.simulation.world_settings import SensorConfig, SimulationConfig, WorldConfig
 from segslam.core import geometry
 from segslam.core.config import load_config
-from segslam.core.trajectory import Poses, camera_from_lidar, write_kitti
+from segslam.core.pose_files import write_kitti
+from segslam.core.trajectory import Poses, camera_from_lidar
 from segslam.core.types import Scan, Trajectory, Vector
 from segslam.labels.encodings import RAW_OF_LABEL
 from segslam.odometry.sweep import GivenOdometry
@@ -106,3 +107,12 @@ SLAM_CONFIG = load_config(None, ["proximity.min_travel_m=60", "adjustment.max_mi
 def drifting_slam() -> Slam:
     """The pipeline for `round_drive`, with odometry that drifts."""
     return Slam(SLAM_CONFIG, odometry=GivenOdometry(drifting(round_drive()[1]), SLAM_CONFIG.odometry))
+
+
+def random_path(rng: np.random.Generator, num_poses: int) -> np.ndarray:
+    """A path of small random steps, as odometry gives it."""
+    T_odom_lidar = [np.eye(4)]
+    for _ in range(num_poses - 1):
+        step = geometry.tangent(rotation_rad=0.1 * rng.normal(size=3), translation_m=[1.0, 0.1, 0.0])
+        T_odom_lidar.append(T_odom_lidar[-1] @ geometry.exp(step))
+    return np.array(T_odom_lidar)

@@ -17,7 +17,7 @@ from helpers.trained_network import train_network
 
 from segslam.bench.labelling import confusion
 from segslam.bench.simulation.files import uncorrected
-from segslam.core.trajectory import write_kitti
+from segslam.core.pose_files import write_kitti
 from segslam.core.types import LoopClosure
 from segslam.labels.encodings import to_labels
 from segslam.labels.label_files import read_ids

@@ -10,7 +10,8 @@ from helpers.drives import round_drive
 
 from segslam.core import geometry
 from segslam.core.errors import SegslamError
-from segslam.core.trajectory import camera_from_lidar, read_poses, write_kitti, write_tum
+from segslam.core.pose_files import read_poses, write_kitti, write_tum
+from segslam.core.trajectory import camera_from_lidar
 from segslam.output.conversion import HEADER, convert
 
 T_CAMERA_LIDAR = geometry.transform(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.0, -0.08, -0.27]))

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from helpers.finished_run import FIRST_SCAN, METRICS, NUM_SCANS, T_CAMERA_LIDAR, make_run
 
-from segslam.core.trajectory import camera_from_lidar, write_kitti, write_tum
+from segslam.core.pose_files import write_kitti, write_tum
+from segslam.core.trajectory import camera_from_lidar
 from segslam.core.types import LoopClosure, SegslamError
 from segslam.output.accuracy import accuracy
 from segslam.output.finished import read_run, true_poses

@@ -17,7 +17,7 @@ from helpers.sessions import write_day
 from helpers.terminal import in_terminal
 
 import segslam.run.fleets.orchestrate
-from segslam.core.trajectory import read_poses
+from segslam.core.pose_files import read_poses
 from segslam.core.types import SegslamError, Step
 from segslam.gnss import enu_from_geodetic
 from segslam.output.finished import read_run

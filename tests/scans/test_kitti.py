@@ -8,7 +8,8 @@ import pytest
 
 from segslam.core import geometry
 from segslam.core.geometry import raise_beams
-from segslam.core.trajectory import camera_from_lidar, read_poses
+from segslam.core.pose_files import read_poses
+from segslam.core.trajectory import camera_from_lidar
 from segslam.core.types import BadScan, Label, SegslamError
 from segslam.scans import Dataset, open_dataset
 from segslam.scans.dataset import read_stamps, selected_rows

@@ -31,7 +31,7 @@ from helpers.recorded_drive import (
 )
 
 from segslam.core.evaluation import trajectory_metrics
-from segslam.core.trajectory import read_poses
+from segslam.core.pose_files import read_poses
 from segslam.core.types import BadScan, SegslamError
 from segslam.gnss.reading import read_fixes
 from segslam.scans import open_dataset

@@ -8,7 +8,7 @@ import pytest
 from helpers.recorded_drive import CLOUD, TOPIC, write_mcap
 
 from segslam.core import geometry
-from segslam.core.trajectory import write_kitti
+from segslam.core.pose_files import write_kitti
 from segslam.core.types import BadScan, Label, SegslamError
 from segslam.scans import open_dataset
 from segslam.scans.dataset import Cloud

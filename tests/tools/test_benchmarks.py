@@ -19,7 +19,8 @@ from segslam.bench.experiments.pairs import PairList
 from segslam.bench.simulation.tracks import example_drive
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.trajectory import camera_from_lidar, write_kitti
+from segslam.core.pose_files import write_kitti
+from segslam.core.trajectory import camera_from_lidar
 from segslam.output.finished import read_run
 from segslam.slam.slam_result import SlamResult
 from tools.benchmarks import (

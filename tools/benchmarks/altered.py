@@ -20,7 +20,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core import geometry
-from segslam.core.trajectory import Poses, read_poses
+from segslam.core.pose_files import read_poses
+from segslam.core.trajectory import Poses
 from segslam.core.types import Points, Vector
 from segslam.output.finished import read_run
 from segslam.scans import open_dataset

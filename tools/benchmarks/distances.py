@@ -18,7 +18,7 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import Config
-from segslam.core.trajectory import read_poses
+from segslam.core.pose_files import read_poses
 from segslam.labels import geometric_labels
 from segslam.registration.prepared import PreparedScan, prepare_scan
 from segslam.scans import open_dataset

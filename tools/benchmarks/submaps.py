@@ -14,7 +14,8 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import Config, load_config
-from segslam.core.trajectory import Poses, read_poses
+from segslam.core.pose_files import read_poses
+from segslam.core.trajectory import Poses
 from segslam.core.types import Points
 from segslam.labels import geometric_labels
 from segslam.registration.prepared import PreparedScan, prepare_scan

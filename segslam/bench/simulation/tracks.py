@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core import geometry
-from segslam.core.trajectory import Poses, lidar_from_camera, read_poses
+from segslam.core.pose_files import read_poses
+from segslam.core.trajectory import Poses, lidar_from_camera
 from segslam.core.types import SegslamError, Vector
 from segslam.core.whole_files import read_text
 from segslam.scans.dataset import read_stamps

@@ -9,7 +9,8 @@ import matplotlib
 from matplotlib.figure import Figure
 
 from segslam.core.errors import counted, noun
-from segslam.core.trajectory import Poses, read_poses
+from segslam.core.pose_files import read_poses
+from segslam.core.trajectory import Poses
 from segslam.core.whole_files import write_whole
 from segslam.output.report import figures
 from segslam.output.report.page import document, picture_section, section, table

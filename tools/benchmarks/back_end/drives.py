@@ -12,7 +12,8 @@ from segslam.bench.simulation.tracks import level_revisits, level_world
 from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.evaluation import trajectory_metrics
-from segslam.core.trajectory import lidar_from_camera, read_poses, travelled_m
+from segslam.core.pose_files import read_poses
+from segslam.core.trajectory import lidar_from_camera, travelled_m
 from segslam.core.types import Alignment, GraphEstimate, LoopClosure, Registration
 from segslam.graph import PoseGraph
 from segslam.graph.noise import odometry_information

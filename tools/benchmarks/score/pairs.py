@@ -9,8 +9,9 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import Config
+from segslam.core.pose_files import read_poses
 from segslam.core.threads import Stopwatch
-from segslam.core.trajectory import Poses, read_poses
+from segslam.core.trajectory import Poses
 from segslam.core.types import Rejected
 from segslam.registration.prepared import PreparedScan
 from segslam.scans import Dataset, open_dataset

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from helpers.drives import round_drive, write_kitti_sequence
@@ -18,7 +19,7 @@ from segslam.bench.experiments.pairs import PairList, Trial, cut_pairs, pair_tri
 from segslam.bench.experiments.rows import Row, read_rows
 from segslam.core.config import Config
 from segslam.core.types import SegslamError
-from segslam.run.fleets.workers import workers
+from segslam.run.fleets.workers import _watched, workers
 from segslam.scans import DataSource
 
 distributed = pytest.importorskip("distributed")
@@ -143,10 +144,25 @@ def test_a_scheduler_that_loses_its_last_worker_is_reported_with_the_remedy(
     assert caplog.messages == [f"--scheduler {address}: no worker is left; start `dask worker {address}` to go on"]
 
 
+def test_a_lost_scheduler_is_not_taken_for_one_without_workers(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("segslam.run.fleets.workers.LOOK_EVERY_S", 0.01)
+    looks: list[None] = []
+    lost = SimpleNamespace(scheduler_info=lambda: looks.append(None) or {})
+    with _watched(lost, "tcp://localhost:1"):
+        end = time.monotonic() + 20
+        while len(looks) < 2 and time.monotonic() < end:
+            time.sleep(0.01)
+    assert len(looks) >= 2
+    assert not caplog.messages
+
+
 STOPPED = """
 import sys, time
 from pathlib import Path
-from segslam.run.fleets.workers import workers
+from types import SimpleNamespace
+from segslam.run.fleets.workers import _watched, workers
 try:
     with workers(Path(sys.argv[1]), number=2, scheduler=None) as (work, _):
         sleeping = work(time.sleep, [(60.0,), (60.0,)])

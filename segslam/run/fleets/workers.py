@@ -118,7 +118,8 @@ def _watched(client: Any, scheduler: str) -> Iterator[None]:
     def watch() -> None:
         had_workers = True
         while not ended.wait(LOOK_EVERY_S):
-            has_workers = bool(client.scheduler_info()["workers"])
+            # of a scheduler that is lost nothing is known; whoever waits for its tasks reports it
+            has_workers = bool(client.scheduler_info().get("workers", had_workers))
             if had_workers and not has_workers:
                 logger.warning(
                     "--scheduler %s: no worker is left; start `dask worker %s` to go on", scheduler, scheduler

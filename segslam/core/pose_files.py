@@ -5,7 +5,6 @@ A pose file does not name its frames: the reader returns T_a_b as stored in the 
 
 import re
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -14,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core.errors import brief
+from segslam.core.stamps import nanoseconds
 from segslam.core.trajectory import LARGEST, NOT_FINITE, ROTATION_TOLERANCE, Poses, from_matrices, from_quaternions
 from segslam.core.types import Indices, SegslamError
 from segslam.core.whole_files import read_text
@@ -26,10 +26,6 @@ LAYOUT: dict[PoseFormat, str] = {
 }
 QUATERNION_LAST = {"xyzxyzw": (0, 1, 2, 3, 4, 5, 6), "xyzwxyz": (0, 1, 2, 4, 5, 6, 3)}
 """Last letters of the names of columns, and where x y z qx qy qz qw are among them."""
-DECIMALS = (9, 6, 3, 0)
-"""Those between nanoseconds and seconds, ms, us and ns."""
-EARLIEST_S, LATEST_S = 1_000_000_000, 4_000_000_000
-"""Years 2001 and 2096: a larger number that is between them in ms, us or ns is taken for such a time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,29 +115,6 @@ def write_tum(path: Path, stamp_ns: Indices, T_a_b: Poses) -> None:
         for stamp, row in zip(stamp_ns, rows, strict=True)
     ]
     path.write_text("".join(line + "\n" for line in lines), encoding="ascii")
-
-
-def nanoseconds(seconds: str) -> int:
-    """The stamp (ns) of a text, exactly; a double cannot represent it. Raises ValueError if it is not a time.
-
-    A number that is too large for seconds may be a time from 2001 to 2096 in ms, us or ns.
-    """
-    try:
-        time = Decimal(seconds)
-        fitting = (num for num in DECIMALS if EARLIEST_S <= time.scaleb(num - 9) < LATEST_S)
-        stamp_ns = int(time.scaleb(next(fitting, DECIMALS[0])).to_integral_value())
-    except (ArithmeticError, ValueError) as error:
-        raise ValueError(f"{brief(seconds)} is not a time in seconds") from error
-    if abs(stamp_ns) >= 2**63:
-        raise ValueError(f"{brief(seconds)} s are more than 292 years")
-    return stamp_ns
-
-
-def dated_nanoseconds(text: str) -> int:
-    """The stamp (ns) of a date and time in UTC, `2011-09-30 12:40:25.072360123`. Raises ValueError for another text."""
-    whole, _, fraction = text.partition(".")
-    since = datetime.fromisoformat(whole).replace(tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)
-    return (since.days * 86_400 + since.seconds) * 1_000_000_000 + int(fraction.ljust(9, "0")[:9])
 
 
 def _lines_and_names(path: Path, *, skips_names: bool) -> tuple[list[tuple[int, list[str]]], _Named | None]:

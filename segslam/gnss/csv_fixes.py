@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from segslam.core.errors import brief
-from segslam.core.pose_files import nanoseconds
+from segslam.core.stamps import nanoseconds, stamp_of
 from segslam.core.types import SegslamError
-from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
+from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in
 
 COLUMNS = {
     "time": "header_stamp time t seconds timestamp stamp stamp_s time_s sec secs utc unix_time",

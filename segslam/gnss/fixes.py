@@ -4,7 +4,6 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +14,8 @@ from segslam.gnss.geodesy import Geodetic
 
 NO_FIX, NOT_FINITE, DUPLICATE, OUTSIDE = "no_fix", "not_finite", "duplicate", "outside_run"
 """Reasons for which a fix is not used, whatever the trajectory is."""
-NMEA = re.compile(rb"\$..(GGA|RMC),")
-"""A sentence, which a receiver may send between binary messages."""
+NMEA = r"\$..(GGA|RMC|GSA|GSV|ZDA),"
+"""Begin of a sentence, which a receiver may send between binary messages (u-blox)."""
 MOST_BYTES = 2**30
 """Chosen: no log of fixes is larger than a gigabyte."""
 
@@ -107,7 +106,7 @@ def text_lines(file: Path) -> list[str]:
         content = file.read_bytes()
     except OSError as error:
         raise SegslamError(f"{unreadable(file, 'fixes', error)}; give another file with --gnss") from error
-    if b"\0" in content[:4096] and not NMEA.search(content):
+    if b"\0" in content[:4096] and not re.search(NMEA.encode(), content):
         raise SegslamError(f"{file}: a binary file; give CSV, NMEA or RTKLIB .pos, a KITTI oxts folder, or a recording")
     return content.decode("utf-8", errors="replace").lstrip("\ufeff").splitlines()
 
@@ -136,10 +135,3 @@ def check_degrees(file: Path, line: int, latitude_deg: float, longitude_deg: flo
         raise bad_line(file, line, f"latitude {latitude_deg:g} is not within -90 and 90 degrees", hint)
     if abs(longitude_deg) > 360.0:
         raise bad_line(file, line, f"longitude {longitude_deg:g} is not within -180 and 180 degrees")
-
-
-def stamp_of(moment: datetime) -> int:
-    """Nanoseconds since 1970 of a moment; one without a time zone is in UTC."""
-    aware = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-    since = aware - datetime(1970, 1, 1, tzinfo=UTC)
-    return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000

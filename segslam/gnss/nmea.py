@@ -9,18 +9,17 @@ from operator import xor
 from pathlib import Path
 
 from segslam.core.errors import counted
+from segslam.core.stamps import stamp_of
 from segslam.core.types import SegslamError
-from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
+from segslam.gnss.fixes import NMEA, Row, bad_line, check_degrees, number_in
 
 LEAST_WORDS = {"GGA": 10, "RMC": 10, "ZDA": 5}
 """Sentences that have a time, and up to which field they are read."""
-MOST_LINES = 1000
-"""Chosen: among so many lines is a sentence, even if a receiver sends binary messages (u-blox) between them."""
 
 
 def is_nmea(lines: Sequence[str]) -> bool:
-    """True if one of the first lines is a sentence."""
-    return any(re.search(r"\$..(GGA|RMC|GSA|GSV|ZDA)", line) for line in lines[:MOST_LINES])
+    """True if a line contains a sentence."""
+    return any(re.search(NMEA, line) for line in lines)
 
 
 def read_nmea(file: Path, lines: Sequence[str]) -> tuple[list[Row], str]:

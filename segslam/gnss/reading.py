@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from segslam.core.errors import brief
-from segslam.core.pose_files import dated_nanoseconds
+from segslam.core.stamps import dated_nanoseconds
 from segslam.core.types import SegslamError
 from segslam.core.whole_files import expanded
 from segslam.gnss.csv_fixes import read_csv

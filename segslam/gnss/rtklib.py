@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in, stamp_of
+from segslam.core.stamps import stamp_of
+from segslam.gnss.fixes import Row, bad_line, check_degrees, number_in
 from segslam.gnss.geodesy import Origin, geodetic_from_ecef, rotation_ecef_enu
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)

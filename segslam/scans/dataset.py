@@ -11,7 +11,7 @@ from segslam.core.config import SensorCalibrationConfig, validated
 from segslam.core.errors import brief, counted
 from segslam.core.geometry import raise_beams
 from segslam.core.points import squared_ranges
-from segslam.core.pose_files import dated_nanoseconds, nanoseconds
+from segslam.core.stamps import dated_nanoseconds, nanoseconds
 from segslam.core.types import BadScan, Indices, Points, Scan, ScanLabels, SegslamError, Trajectory, Transform, Vector
 from segslam.core.whole_files import expanded, read_text
 from segslam.labels.encodings import ENCODINGS, Encoding

@@ -182,30 +182,6 @@ def test_named_format_is_demanded(tmp_path: Path) -> None:
         pose_files.read_poses(tmp_path / "poses.txt", format="tum")
 
 
-@pytest.mark.parametrize(
-    ("text", "stamp_ns"),
-    [
-        ("0", 0),
-        ("1.5", 1_500_000_000),
-        ("4.574208e+02", 457_420_800_000),
-        ("1764000000.123456789", 1764000000123456789),
-        ("1764000000123", 1764000000123000000),
-        ("1764000000123456", 1764000000123456000),
-        ("1764000000123456789", 1764000000123456789),
-        ("1.764000000123456789e18", 1764000000123456789),
-        ("4000000000", 4_000_000_000_000_000_000),
-    ],
-)
-def test_seconds_become_exact_nanoseconds(text: str, stamp_ns: int) -> None:
-    assert pose_files.nanoseconds(text) == stamp_ns
-
-
-@pytest.mark.parametrize("text", ["", "now", "nan", "inf"])
-def test_text_that_is_no_time_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="is not a time in seconds"):
-        pose_files.nanoseconds(text)
-
-
 def test_stamp_beyond_any_clock_is_named_with_its_line(tmp_path: Path) -> None:
     file = tmp_path / "poses.txt"
     file.write_text("0 1 2 3 0 0 0 1\n1e19 1 2 3 0 0 0 1\n")  # nanoseconds taken for seconds

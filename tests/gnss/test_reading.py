@@ -13,8 +13,9 @@ from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_typestore
 
+from segslam.core.stamps import stamp_of
 from segslam.core.types import SegslamError
-from segslam.gnss.fixes import make_fixes, stamp_of
+from segslam.gnss.fixes import make_fixes
 from segslam.gnss.geodesy import Origin, ecef_from_geodetic, enu_from_geodetic
 from segslam.gnss.reading import read_fixes, row_of
 

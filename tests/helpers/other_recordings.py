@@ -8,11 +8,9 @@ from typing import Any
 
 import numpy as np
 from mcap.writer import Writer as McapWriter
-from rosbags.rosbag1 import Writer as Bag1Writer
-from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from helpers.recorded_drive import MESSAGE, TOPIC, Drive, messages, write_bag2
+from helpers.recorded_drive import MESSAGE, TOPIC, Drive, messages, write_bag, write_bag2
 
 LIVOX = "livox_ros_driver2/msg/CustomMsg"
 POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
@@ -49,20 +47,12 @@ def write_mcap_of_ros1(file: Path) -> Path:
 
 def write_livox_bag1(file: Path, drive: Drive) -> Path:
     store = _livox_store(Stores.ROS1_NOETIC)
-    with Bag1Writer(file) as writer:
-        connection = writer.add_connection(TOPIC, LIVOX, typestore=store)
-        for stamp_ns, message in _livox_messages(store, drive):
-            writer.write(connection, stamp_ns, store.serialize_ros1(message, LIVOX))
-    return file
+    return write_bag(file, store, LIVOX, _livox_messages(store, drive), ros=1)
 
 
 def write_livox_bag2(folder: Path, drive: Drive) -> Path:
     store = _livox_store(Stores.ROS2_HUMBLE)
-    with Bag2Writer(folder, version=8) as writer:
-        connection = writer.add_connection(TOPIC, LIVOX, typestore=store)
-        for stamp_ns, message in _livox_messages(store, drive):
-            writer.write(connection, stamp_ns, store.serialize_cdr(message, LIVOX))
-    return folder
+    return write_bag(folder, store, LIVOX, _livox_messages(store, drive), ros=2)
 
 
 def write_livox_mcap(file: Path, drive: Drive) -> Path:

@@ -1,6 +1,6 @@
 """A simulated drive as a turning sensor sees it, and its recordings, written by others' writers."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -107,20 +107,22 @@ def write_mcap(file: Path, drive: Drive = (), *, chunk_size: int = 2**20, has_st
 
 def write_bag1(file: Path, drive: Drive = ()) -> Path:
     store = get_typestore(Stores.ROS1_NOETIC)
-    with Bag1Writer(file) as writer:
-        connection = writer.add_connection(TOPIC, MESSAGE, typestore=store)
-        for received_ns, message in messages(store, drive):
-            writer.write(connection, received_ns, store.serialize_ros1(message, MESSAGE))
-    return file
+    return write_bag(file, store, MESSAGE, messages(store, drive), ros=1)
 
 
 def write_bag2(folder: Path, drive: Drive = ()) -> Path:
     store = get_typestore(Stores.ROS2_HUMBLE)
-    with Bag2Writer(folder, version=8) as writer:
-        connection = writer.add_connection(TOPIC, MESSAGE, typestore=store)
-        for received_ns, message in messages(store, drive):
-            writer.write(connection, received_ns, store.serialize_cdr(message, MESSAGE))
-    return folder
+    return write_bag(folder, store, MESSAGE, messages(store, drive), ros=2)
+
+
+def write_bag(path: Path, store: Any, kind: str, received: Iterable[tuple[int, Any]], *, ros: int) -> Path:
+    """A bag of messages of a kind, each with the time at which it was received."""
+    serialize = store.serialize_ros1 if ros == 1 else store.serialize_cdr
+    with Bag1Writer(path) if ros == 1 else Bag2Writer(path, version=8) as writer:
+        connection = writer.add_connection(TOPIC, kind, typestore=store)
+        for received_ns, message in received:
+            writer.write(connection, received_ns, serialize(message, kind))
+    return path
 
 
 def _as_dict(stamp_ns: int, rows: np.ndarray) -> dict[str, Any]:

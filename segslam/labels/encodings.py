@@ -94,24 +94,24 @@ def to_ids(labels: Labels, encoding: Encoding) -> Ids:
 def detect_encoding(num_points_of_id: Histogram) -> Encoding:
     """The only encoding that fits the ids of some scans; `num_points_of_id` counts the points of each id.
 
-    An encoding is excluded if it does not contain all ids. If several remain, an encoding is also excluded if more than
-    2 % of the points would be two-wheelers, or less than 2 % road. Raises SegslamError, with the reason, unless exactly
-    one encoding remains.
+    An encoding is excluded if it does not contain all ids. Unless only `raw` remains, an encoding is also excluded if
+    more than 2 % of the points would be two-wheelers, or less than 2 % road. Raises SegslamError, with the reason,
+    unless exactly one encoding remains.
     """
     ids = np.flatnonzero(num_points_of_id)
     fitting = [
         encoding for encoding, table in _TABLES.items() if (table[np.minimum(ids, len(table) - 1)] != UNKNOWN).all()
     ]
-    possible = [one for one in fitting if len(fitting) == 1 or _looks_like_a_street(num_points_of_id, one)]
+    possible = [one for one in fitting if fitting == ["raw"] or _looks_like_a_street(num_points_of_id, one)]
     if len(possible) != 1:
         shown = ", ".join(str(value) for value in ids[:30]) or "none"
         why = "no encoding contains all of them"
         if fitting:
-            shares = "the shares of road and two-wheelers do not decide between these"
+            shares = "the shares of road and two-wheelers do not confirm exactly one"
             why = f"they fit {' and '.join(fitting)}, and {shares}"
         raise SegslamError(
             f"the numbering of the classes cannot be detected (ids: {shown}): {why}; "
-            f"pass --encoding {'|'.join(ENCODINGS)}"
+            f"pass --encoding {'|'.join(ENCODINGS)}, or --labels geometric if the classes are not SemanticKITTI's"
         )
     return possible[0]
 

@@ -76,6 +76,7 @@ def test_one_id_can_determine_the_encoding(ids: list[int], encoding: Encoding) -
         {0: 100, 10: 500, 11: 20},  # cars by the raw ids, parking by the learning ids
         dict.fromkeys(range(19), 100),  # no street has as many motorcyclists as road
         {0: 60, 12: 500, 14: 400},  # no road in either reading
+        {4: 20, 7: 90, 8: 40, 9: 300, 15: 200, 21: 5, 22: 300},  # SemanticPOSS: its ground would move
     ],
 )
 def test_ambiguous_ids_are_reported_with_the_reason(points_of_id: dict[int, int]) -> None:

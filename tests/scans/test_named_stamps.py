@@ -16,6 +16,7 @@ from segslam.scans.named_stamps import stamp_of_name, stamps_of_names
         ("1700000000_000000001", 1_700_000_000_000_000_001),
         ("1700000000123456789", 1_700_000_000_123_456_789),
         ("1700000000123456", 1_700_000_000_123_456_000),
+        ("1700000000123", 1_700_000_000_123_000_000),
         ("000123", None),
         ("scan_1700000000.25", None),
     ],
@@ -40,6 +41,7 @@ def _folder(folder: Path, stems: list[str], *, suffix: str = ".bin") -> Path:
         ["1700000000.950000", "1700000000.982590", "1700000001.082591"],
         ["1700000000.950000000", "1700000000.982590000", "1700000001.82591000"],  # seconds and nanoseconds
         ["cloud_1700000000_950000000", "cloud_1700000000_982590000", "cloud_1700000001_82591000"],  # Newer College
+        [f"n015__LIDAR_TOP__{us}.pcd" for us in (1700000000950000, 1700000000982590, 1700000001082591)],  # nuScenes
     ],
 )
 def test_a_folder_whose_names_are_stamps_has_these_stamps_and_their_order(tmp_path: Path, stems: list[str]) -> None:
@@ -54,6 +56,7 @@ def test_a_folder_whose_names_are_stamps_has_these_stamps_and_their_order(tmp_pa
         ["0000000000", "0000000001", "0000000002"],  # KITTI's raw data
         ["1700000000.1", "1700000000.2", "last"],
         ["1700000000.1", "1700000000.10", "1700000000.2"],
+        ["9999999999999999997", "9999999999999999998", "9999999999999999999"],
         ["front_1700000000.1", "front_1700000000.2", "rear_1700000000.3"],
     ],
 )

@@ -24,6 +24,8 @@ LAYOUT: dict[PoseFormat, str] = {
     "kitti": "KITTI format has 12 numbers per line, a 3x4 matrix by rows",
     "tum": "TUM format has 8 numbers per line: seconds x y z qx qy qz qw",
 }
+TIME = re.compile("time|stamp|sec|^t$")
+"""Names of the time in other files: a first column without it may be a number of the pose (MCD, Oxford Spires)."""
 QUATERNION_LAST = {"xyzxyzw": (0, 1, 2, 3, 4, 5, 6), "xyzwxyz": (0, 1, 2, 4, 5, 6, 3)}
 """Last letters of the names of columns, and where x y z qx qy qz qw are among them."""
 
@@ -41,28 +43,29 @@ class PoseFile:
 
 
 class _Named(NamedTuple):
-    """The columns of a file that names them; the first is the time."""
+    """The columns of a file that names them; the first is the time, or the second after a number of the pose."""
 
     places: tuple[int, ...]
     """Those of x y z qx qy qz qw."""
     num_columns: int
+    time: int
     is_ns: bool
     """True if the time is in nanoseconds by its name."""
     has_ns_beside: bool
-    """True if the second column has the nanoseconds of a time in whole seconds."""
+    """True if the column after the time has the nanoseconds of a time in whole seconds."""
 
     def ordered(self, fields: list[str]) -> list[str]:
         """The fields in the order of TUM format. Raises ValueError for another number of columns, or of no time."""
         if len(fields) != self.num_columns:
             raise ValueError(f"found {len(fields)} columns, but the line of names has {self.num_columns}")
-        time = fields[0]
+        time = fields[self.time]
         try:
             if self.is_ns:
                 time = str(Decimal(time).scaleb(-9))
             elif self.has_ns_beside:
-                time = str(Decimal(time) + Decimal(fields[1]).scaleb(-9))
+                time = str(Decimal(time) + Decimal(fields[self.time + 1]).scaleb(-9))
         except ArithmeticError as error:
-            raise ValueError(f"{brief(' '.join(fields[:2]))} is not a time") from error
+            raise ValueError(f"{brief(' '.join(fields[self.time :][:2]))} is not a time") from error
         return [time, *(fields[place] for place in self.places)]
 
 
@@ -157,12 +160,14 @@ def _named(names: list[str]) -> _Named | None:
     order = QUATERNION_LAST.get(_axes(names)[:7])
     if order is None or names[0].endswith(tuple("xyzw")):
         return None
+    time = int(bool(TIME.search(names[1])) and not TIME.search(names[0]))
     places = [place for place, name in enumerate(names) if place and name.endswith(tuple("xyzw"))]
     return _Named(
         tuple(places[k] for k in order),
         len(names),
-        is_ns=bool(re.search(r"(?<![a-z])ns$|nanosec", names[0])),
-        has_ns_beside=bool(re.fullmatch(r"n(ano)?secs?", names[1])),
+        time,
+        is_ns=bool(re.search(r"(?<![a-z])ns$|nanosec", names[time])),
+        has_ns_beside=bool(re.fullmatch(r"n(ano)?secs?", names[time + 1])),
     )
 
 

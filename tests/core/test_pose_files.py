@@ -94,6 +94,8 @@ ECHOED = "%time,field.header.seq,field.child_frame_id," + ",".join(
         ("helipr.txt", "1700000000123456789 1 2 3 0.6 0 0 0.8"),
         ("newer_college.csv", "#sec,nsec,x,y,z,qx,qy,qz,qw\n1700000000,123456789,1,2,3,0.6,0,0,0.8"),
         ("newer_college.csv", "sec, nsec, x, y, z, qx, qy, qz, qw\n1700000000,123456789,1,2,3,0.6,0,0,0.8"),
+        ("mcd.csv", "num,t,x,y,z,qx,qy,qz,qw\n5,1700000000.123456789,1,2,3,0.6,0,0,0.8"),
+        ("spires.csv", "# counter, sec, nsec, x, y, z, qx, qy, qz, qw\n5, 1700000000, 123456789, 1,2,3,0.6,0,0,0.8"),
         ("euroc.csv", f"# EuRoC\n{EUROC}\n1700000000123456789,1,2,3,0.8,0.6,0,0,9,9,9,9"),
         ("tum_vi.csv", "#timestamp [ns],tx,ty,tz,qw,qx,qy,qz\r\n1700000000123456789,1,2,3,0.8,0.6,0,0\r"),
         ("w_first.txt", "# timestamp(s) tx ty tz qw qx qy qz\n\n1700000000.123456789 1 2 3 0.8 0.6 0 0"),

@@ -27,6 +27,7 @@ def found_in(scans: "Dataset", settings: "Config") -> dict[str, Any]:
         "first_scan": int(scans.scan_index[0]),
         "last_scan": int(scans.scan_index[-1]),
         "seconds": seconds,
+        "vertical_angle_deg": scans.vertical_angle_deg,
         "scans_per_second": int(scans.scan_index[last_row] - scans.scan_index[first_row]) / seconds
         if seconds > 0
         else None,
@@ -53,6 +54,7 @@ def lines(found: dict[str, Any]) -> str:
     rate = f", {found['scans_per_second']:.1f}/s" if found["scans_per_second"] else ""
     nearest, middle, farthest = scan["range_m"]
     low, high = scan["elevation_deg"]
+    raised = f", {found['vertical_angle_deg']:+g} of correction" if found["vertical_angle_deg"] else ""
     truth = f"for {counted(found['num_true_poses'], 'scan')}" if found["num_true_poses"] else "none"
     changed = ", ".join(f"{key}={value}" for key, value in found["changed_settings"].items()) or "defaults"
     return "\n".join(
@@ -60,7 +62,7 @@ def lines(found: dict[str, Any]) -> str:
             f"{found['data']}: {counted(found['num_scans'], 'scan')}, {found['first_scan']} to {found['last_scan']}, "
             f"over {found['seconds']:.1f} s{rate}",
             f"scan {scan['scan']}: {scan['num_points']} points at {nearest:.1f} to {farthest:.1f} m (median "
-            f"{middle:.1f} m), elevations {low:.1f} to {high:.1f} degrees; "
+            f"{middle:.1f} m), elevations {low:.1f} to {high:.1f} degrees{raised}; "
             f"point times: {_times(scan)}; "
             f"intensities: {'read' if scan['has_intensities'] else 'not read'}",
             f"labels: {found['labels']}",

@@ -101,11 +101,14 @@ def test_a_dry_run_shows_what_was_found_and_writes_nothing(
     assert (found["data"], found["num_scans"], found["first_scan"], found["last_scan"]) == ("kitti/00", 6, 2, 7)
     assert found["scans_per_second"] == pytest.approx(1 / 0.3)
     assert found["num_true_poses"] == 6
+    assert found["vertical_angle_deg"] == 0.205
     assert found["labels"] == "geometric"
     assert found["first_usable_scan"]["num_points"] > 1000
     assert found["changed_settings"] == {"keyframes.distance_m": "4.0"}
     assert run(*arguments) == 0
-    assert "6 scans, 2 to 7" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "6 scans, 2 to 7" in shown
+    assert "degrees, +0.205 of correction; point times" in shown  # that of KITTI's layout
     assert list(tmp_path.iterdir()) == []
 
 

@@ -14,13 +14,14 @@ from segslam.scans.dataset import Cloud
 from segslam.scans.kitti import read_returns
 from segslam.scans.pcd import parse_pcd
 from segslam.scans.ply import parse_ply
+from segslam.scans.records import read_records
 from segslam.scans.scan_files import INTENSITY_FIELDS, NO_POINTS, TIME_FIELDS, Columns, read_bytes
 
 SUFFIXES = (".bin", ".npy", ".ply", ".pcd")
 
 
 def read_file(file: Path) -> Cloud:
-    """The points of a file: .bin (float32 x y z intensity), .npy (n, 3 or more), .ply, .pcd.
+    """The points of a file: .bin (float32 x y z intensity, or as in `records`), .npy (n, 3 or more), .ply, .pcd.
 
     Intensities are the fourth column of .bin and .npy, or a field with one of the usual names in .ply and .pcd.
     Raises SegslamError, naming the file: BadScan for one that is missing, invalid, truncated or too large.
@@ -28,7 +29,8 @@ def read_file(file: Path) -> Cloud:
     try:
         match file.suffix.lower():
             case ".bin":
-                return _from_rows(read_returns(file))
+                columns = read_records(file)
+                return _from_rows(read_returns(file)) if columns is None else from_columns(columns)
             case ".npy":
                 return _from_rows(_parse_npy(read_bytes(file)))
             case ".ply":

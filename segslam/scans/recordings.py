@@ -5,6 +5,7 @@ The number of a scan is its position in the recording.
 
 import contextlib
 import io
+import logging
 import re
 import warnings
 from dataclasses import replace
@@ -30,14 +31,29 @@ from segslam.scans.dataset import (
 )
 from segslam.scans.named_stamps import stamps_of_names
 
+logger = logging.getLogger(__name__)
+
 ASSUMED_PERIOD_NS = 100_000_000  # 10 Hz, the rate of most LiDARs; used if there are no stamps
 RAW = "velodyne_points"
 """Folder of KITTI's raw data, and of KITTI-360, with the scans in `data/` and their dates in `timestamps.txt`."""
 KIND_OF_SUFFIX = {".mcap": "mcap", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "ouster"}
+ROOTS = {
+    "apollo": ("pcds", "poses/gt_poses.txt"),
+    "boreas": ("lidar", "applanix/lidar_poses.csv"),
+    "helipr": ("LiDAR", "LiDAR_GT"),
+    "mulran": ("Ouster", "global_pose.csv"),
+    "ncd": ("raw_format/ouster_scan", "ground_truth/registered_poses.csv"),
+    "nclt": ("velodyne_sync",),
+}
+"""Files and folders in the folder of a drive, by the reader of kiss_icp that reads it."""
 REMEDIES = {
     "mcap": "; `mcap recover IN -o OUT` copies what can be read",
+    "helipr": "; give --sequence Ouster, Velodyne, Avia or Aeva",
     "rosbag": "; after a crash, `rosbag reindex FILE` (ROS 1) or `ros2 bag reindex FOLDER` (ROS 2) makes its index",
 }
+READ_HERE = {"boreas": "", "helipr": "", "ncd": "scan_folder", "nclt": "scans_dir"}
+"""Readers of kiss_icp that find scans and true poses, and their attribute with the folder of the scans if the names of
+files lack it. The files are read here, with their times and intensities."""
 FOREIGN_ERRORS = (Exception, SystemExit)
 """Readers of other projects raise anything for damaged data; it becomes an error that names the file."""
 
@@ -48,6 +64,7 @@ class Recording(Dataset):
     def __init__(self, source: DataSource) -> None:
         """Raises SegslamError, with the error of the reader, if it cannot be opened or contains no scan."""
         kind, self._source, self._loader = _opened(source)
+        self._kind = kind
         beside = _beside(self._source)
         self.name = f"{kind}/{beside.resolve().name}"
         self._has_intensities = source.intensities
@@ -77,10 +94,13 @@ class Recording(Dataset):
             check_num_lines(poses_file, len(poses), self.num_recorded)
         else:
             poses = np.asarray(getattr(self._loader, "gt_poses", np.empty((0, 4, 4))), dtype=float)
+            if len(poses) not in (0, self.num_recorded):
+                what = f"{len(poses)} true poses for {self.num_recorded} scans"
+                logger.warning("%s: %s are not used; see `segslam eval --reference`", source.data, what)
+                poses = poses[:0]
         self.reference = None
-        posed = self.scan_index[self.scan_index < len(poses)]
-        if len(posed):
-            self.reference = Trajectory(posed, self._stamps[posed], poses[posed])
+        if len(poses):
+            self.reference = Trajectory(self.scan_index, self._stamps[self.scan_index], poses[self.scan_index])
 
     def _read(self, row: int) -> tuple[Path, int, Cloud]:
         """As in the base class; readers of kiss_icp give points, or points and times."""
@@ -88,7 +108,7 @@ class Recording(Dataset):
         file = self._file(index)
         try:
             with contextlib.redirect_stdout(io.StringIO()):
-                item = self._loader[index]
+                item = read_file(file) if self._kind in READ_HERE else self._loader[index]
             if not isinstance(item, Cloud):
                 item = Cloud(*item) if isinstance(item, tuple) else Cloud(item)
                 if self._has_intensities or self.labels.network:
@@ -114,7 +134,8 @@ class Recording(Dataset):
     def _file(self, index: int) -> Path:
         """The file of a scan; a name with its number for recordings of many scans."""
         files = getattr(self._loader, "scan_files", None)
-        return Path(str(files[index])) if files is not None else self._source / f"{index:06d}"
+        folder = Path(getattr(self._loader, READ_HERE.get(self._kind, ""), ""))
+        return folder / str(files[index]) if files is not None else self._source / f"{index:06d}"
 
 
 class ScanFolder:
@@ -196,14 +217,10 @@ def _loader(kind: str, source: Path, sequence: str, topic: str) -> Any:
             from segslam.scans.ouster import OusterFrames
 
             return OusterFrames(source)
-        case "nclt":
-            from segslam.scans.nclt import NcltDay
-
-            return NcltDay(source)
     from kiss_icp.datasets import dataset_factory
 
     with contextlib.redirect_stderr(io.StringIO()):  # here alone: warnings of our own readers are for the user
-        return dataset_factory(kind, source, sequence=sequence, topic=topic)
+        return dataset_factory(kind, source.resolve(), sequence=sequence, topic=topic)
 
 
 def _kind_of(data: Path) -> str:
@@ -215,14 +232,21 @@ def _kind_of(data: Path) -> str:
         return "rosbag"
     if data.is_dir() and scan_files(_scans_folder(data)):
         return "generic"
+    for kind, names in ROOTS.items():
+        if all((data / name).exists() for name in names):
+            return kind
     if files := sorted(file for suffix in ("db3", "mcap") for file in data.glob(f"*.{suffix}")):
         raise SegslamError(
             f"{data}: no metadata.yaml, as after a crash; `ros2 bag reindex {data}` makes that of a ROS 2 bag; or give "
             f"a file: {files[0]}"
         )
+    files = [file for file in ([data] if data.is_file() else data.iterdir()) if file.is_file()]
+    suffixes = sorted({file.suffix for file in files} - {"", *SUFFIXES})
+    others = f" (only {' '.join(suffixes[:9])})" if suffixes else ""
     raise SegslamError(
-        f"{data}: found neither sequences/ nor velodyne/ (KITTI), nor clouds (.bin .ply .pcd ...), nor a rosbag, .mcap "
-        "or .pcap; give the folder that contains them, or the kind by --dataset"
+        f"{data}: found neither sequences/ nor velodyne/ (KITTI), nor clouds (.bin .ply .pcd .npy), nor a rosbag, "
+        f".mcap or .pcap{others}; give the folder that contains them, convert scans of another format to .npy, or give "
+        "the kind by --dataset"
     )
 
 

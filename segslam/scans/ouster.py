@@ -180,7 +180,8 @@ def _metadata_of(file: Path) -> Path:
     alike = [path for path in beside if path.stem.startswith(file.stem) or file.stem.startswith(path.stem)]
     found = alike or beside
     if len(found) != 1 and file.with_suffix(".json") not in found:
-        raise FileNotFoundError(f"the sensor's metadata are missing: put them beside the recording as {file.stem}.json")
+        missing = f"the sensor's metadata are missing: put them beside the recording as {file.stem}.json"
+        raise FileNotFoundError(f"{missing}; of sensors other than Ouster's, give a bag with point clouds, not packets")
     return found[0] if len(found) == 1 else file.with_suffix(".json")
 
 

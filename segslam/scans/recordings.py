@@ -47,6 +47,7 @@ ROOTS = {
 }
 """Files and folders in the folder of a drive, by the reader of kiss_icp that reads it."""
 REMEDIES = {
+    **dict.fromkeys(ROOTS, "; or give the folder of the scans alone, if there are no true poses for them"),
     "mcap": "; `mcap recover IN -o OUT` copies what can be read",
     "helipr": "; give --sequence Ouster, Velodyne, Avia or Aeva",
     "rosbag": "; after a crash, `rosbag reindex FILE` (ROS 1) or `ros2 bag reindex FOLDER` (ROS 2) makes its index",

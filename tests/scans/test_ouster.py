@@ -115,7 +115,7 @@ def test_older_metadata_without_sections_are_read_as_well(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("metadata", "start", "message"),
     [
-        (None, b"", r"metadata are missing: put them beside the recording as drive\.json"),
+        (None, b"", r"metadata are missing: put them beside the recording as drive\.json.* of sensors other than"),
         (metadata("RGB"), b"", "packets of profile RGB; known: LEGACY"),
         (metadata("LEGACY", lidar_intrinsics={}), b"", "has no key 'lidar_to_sensor_transform'"),
         (metadata("RNG19_RFL8_SIG16_NIR16"), b"", "finds no scan in it"),

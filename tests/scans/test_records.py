@@ -156,6 +156,12 @@ def test_helipr_needs_the_name_of_a_sensor(tmp_path: Path) -> None:
         open_dataset(tmp_path)
 
 
+def test_a_drive_without_true_poses_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    (tmp_path / "2012-01-08/velodyne_sync").mkdir(parents=True)
+    with pytest.raises(SegslamError, match=r"as nclt data .*; or give the folder of the scans alone"):
+        open_dataset(tmp_path / "2012-01-08")
+
+
 def test_true_poses_of_another_number_than_the_scans_are_not_used(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -29,6 +29,10 @@ class LoopEdits:
         """These edits followed by others, which win where the two contradict."""
         return LoopEdits((self.forbidden - later.added) | later.forbidden, (self.added - later.forbidden) | later.added)
 
+    def shifted(self, by: int) -> "LoopEdits":
+        """The same where the ids of all keyframes are larger by this number."""
+        return LoopEdits(*(frozenset((a + by, b + by) for a, b in pairs) for pairs in (self.forbidden, self.added)))
+
     def to_json(self) -> str:
         """Text for the options of a log."""
         return json.dumps({"forbidden": sorted(self.forbidden), "added": sorted(self.added)})

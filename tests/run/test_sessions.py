@@ -26,8 +26,11 @@ from segslam.output.log import read_log
 from segslam.output.map import picture
 from segslam.output.report import comparison, figures
 from segslam.output.report.loops import top_view
+from segslam.run.sessions import merge
 from segslam.run.sessions.merge import arranged
 from segslam.run.sessions.recorded import Part, SessionPose, figures_of, read_sessions
+from segslam.slam.loop_edits import LoopEdits
+from segslam.slam.slam import Slam
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("short_runs")]
 
@@ -157,6 +160,21 @@ def test_true_poses_after_the_last_scan_of_a_session_are_not_those_of_the_next(d
     assert early is not None
     np.testing.assert_array_equal(early.scan_index, whole.scan_index)
     np.testing.assert_array_equal(early.T_world_lidar, whole.T_world_lidar)
+
+
+def test_loops_that_a_person_forbade_in_a_session_stay_forbidden(
+    days: Days, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monday, friday = read_sessions([days.monday.folder, days.friday.folder])
+    edited = LoopEdits(forbidden=frozenset({(9, 1)}), added=frozenset({(8, 2)}))
+    options = {**friday.run.options, "edits": edited.to_json()}
+    friday = replace(friday, run=replace(friday.run, options=options))
+    given: list[LoopEdits] = []
+    monkeypatch.setattr(merge, "Slam", lambda config, edits, **more: given.append(edits) or Slam(config, **more))
+    first = len(monday.keyframes)
+    with arranged([monday, friday], [None, SessionPose(0, np.eye(4), ())]).begun(tmp_path, Config()):
+        again = LoopEdits.from_json(read_log(tmp_path).options["edits"])
+    assert given == [again] == [LoopEdits(frozenset({(9 + first, 1 + first)}), frozenset({(8 + first, 2 + first)}))]
 
 
 @pytest.fixture(scope="module")

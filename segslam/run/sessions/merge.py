@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, reduce
 from itertools import islice, product
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from segslam.run.run import Run
 from segslam.run.sessions.recorded import Session, SessionPose, Shift, known_of, read_sessions, shifted, shifted_steps
 from segslam.run.sessions.session_pose import Relation, attempt, find_session
 from segslam.slam.adjustment.known import Kept, nothing_kept
+from segslam.slam.loop_edits import NO_EDITS, LoopEdits
 from segslam.slam.slam import Slam
 
 OPTIMIZE_EVERY = 25
@@ -69,13 +70,14 @@ class Merged:
             }
             for session in self.sessions
         ]
+        edits = reduce(LoopEdits.and_then, map(_edits, self.sessions))
         return Run(
             folder,
-            Slam(config, known=known_of(self.sessions, kept)),
+            Slam(config, edits=edits, known=known_of(self.sessions, kept)),
             dataset=" + ".join(dict.fromkeys(session.run.dataset for session in self.sessions)),
             T_camera_lidar=self.sessions[0].run.T_camera_lidar,
             reference=self.reference,
-            options={"sessions": json.dumps(rows)},
+            options={"sessions": json.dumps(rows), "edits": "" if edits == NO_EDITS else edits.to_json()},
         )
 
     def steps(self, before: RunLog | None = None) -> Iterator[StepToTake]:
@@ -195,6 +197,11 @@ def write_merged(
         for step in run.take(merged.steps(before)):
             on_step(step)
         run.complete(place=merged.georeference)
+
+
+def _edits(session: Session) -> LoopEdits:
+    """The edits of a session by the new ids of its keyframes."""
+    return LoopEdits.from_json(session.run.options.get("edits", "")).shifted(session.shift.keyframe_id)
 
 
 def _placed(sessions: Sequence[Session], session_poses: Sequence[SessionPose | None]) -> Iterator[Session]:

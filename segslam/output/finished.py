@@ -117,7 +117,8 @@ def true_poses(
     """Ground-truth LiDAR poses of the scans of a run, from a KITTI or TUM file.
 
     KITTI rows are matched by scan number; they are camera poses if the data of the run is KITTI's. TUM rows are matched
-    by stamp. Raises SegslamError if no scan has a pose, or if the number of KITTI rows does not match the run.
+    by stamp. Raises SegslamError if no scan has a pose, if the number of KITTI rows does not match the run, and for
+    stamps of a merged run that were shifted: another scan has them in the file.
     """
     poses, scans = read_poses(file, format=format), run.result.trajectory
     T_world_lidar = poses.T_a_b
@@ -126,6 +127,11 @@ def true_poses(
         rows, numbers = scans.scan_index, np.arange(len(scans))
         if run.T_camera_lidar is not None:
             T_world_lidar = lidar_from_camera(T_world_lidar, run.T_camera_lidar)
+    elif shifted := [one["run"] for one in json.loads(run.options.get("sessions", "[]")) if one["stamp_shift_ns"]]:
+        raise SegslamError(
+            f"{file}: matched by stamp, but the merged run has other stamps than {shifted[0]}; score each run, or give "
+            "KITTI format, one line per scan"
+        )
     else:
         rows, numbers = rows_of_same_stamp(poses.stamp_ns, scans.stamp_ns, max_difference_ns=max_difference_ns).T
     if len(rows) == 0:
@@ -137,7 +143,8 @@ def _check_length(file: Path, num_poses: int, run: FinishedRun) -> None:
     last = int(run.result.trajectory.scan_index[-1])
     num_read = run.metrics.get("num_scans", 0) + run.metrics.get("num_scans_skipped", 0)
     took_all = run.options.get("frames") == "" and not run.dataset.startswith("kitti/")  # whose numbers may have gaps
-    if num_poses <= last or (took_all and num_poses != num_read):
+    is_other = "sessions" in run.options and num_poses != last + 1  # of a drive, whose numbers are not those of all
+    if num_poses <= last or is_other or (took_all and num_poses != num_read):
         raise SegslamError(
             f"{file}: {num_poses} poses, but the run has scans up to number {last}; KITTI format needs one line per "
             "scan, line n + 1 for scan n. TUM format is matched by stamp and may omit scans"

@@ -1,5 +1,6 @@
 """A finished run read back, and true poses brought to its scans."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -69,6 +70,24 @@ def test_kitti_truth_of_another_length_than_all_the_data_is_refused(tmp_path: Pa
     with pytest.raises(SegslamError, match="346 poses"):
         true_poses(tmp_path / "truth.txt", folder_of_scans)
     assert len(true_poses(tmp_path / "truth.txt", replace(folder_of_scans, options={"frames": "5:125"}))) == NUM_SCANS
+
+
+def test_truth_of_a_drive_is_not_that_of_scans_with_other_numbers_and_stamps_in_a_merged_run(tmp_path: Path) -> None:
+    """The numbers and stamps of the second session of a merged run belong to other scans of a longer drive."""
+    run = read_run(make_run(tmp_path / "run", with_truth=False).folder)
+    rows = [{"run": "monday", "stamp_shift_ns": 0}, {"run": "friday", "stamp_shift_ns": 10**9}]
+    merged = replace(run, options={"sessions": json.dumps(rows)})
+    poses = np.tile(np.eye(4), (FIRST_SCAN + NUM_SCANS + 30, 1, 1))
+    write_kitti(tmp_path / "kitti.txt", poses)
+    with pytest.raises(SegslamError, match=r"kitti\.txt: 155 poses, but the run has scans up to number 124"):
+        true_poses(tmp_path / "kitti.txt", merged)
+    write_kitti(tmp_path / "kitti.txt", poses[: FIRST_SCAN + NUM_SCANS])
+    assert len(true_poses(tmp_path / "kitti.txt", merged)) == NUM_SCANS, "a line for each scan of the merged run"
+    write_tum(tmp_path / "tum.txt", run.result.trajectory.stamp_ns, run.result.trajectory.T_world_lidar)
+    with pytest.raises(SegslamError, match=r"tum\.txt: matched by stamp, but the merged run has other .* than friday"):
+        true_poses(tmp_path / "tum.txt", merged)
+    later = replace(run, options={"sessions": json.dumps(rows[:1])})
+    assert len(true_poses(tmp_path / "tum.txt", later)) == NUM_SCANS, "no stamp was shifted"
 
 
 def test_tum_truth_is_found_by_stamp(tmp_path: Path) -> None:

@@ -155,7 +155,9 @@ def recorded_fixes(folder: Path, *, stamp_shift_ns: int = 0) -> tuple[list[Row],
 
 def _write(run: FinishedRun, placed: Georeference, use: Use, offset_s: float) -> None:
     trajectory, fixes = run.result.trajectory, placed.fixes
-    T_enu_lidar = corrected_poses(trajectory.T_world_lidar, run.result.keyframe_rows, placed.T_enu_keyframe)
+    rows = run.result.keyframe_rows
+    after_break = np.isin(rows, [row for row, motion in enumerate(run.result.motions) if motion.is_break])
+    T_enu_lidar = corrected_poses(trajectory.T_world_lidar, rows, placed.T_enu_keyframe, after_break=after_break)
     within = np.isfinite(placed.residual_m[:, 0])  # the drive
     measured_ns = fixes.stamp_ns[within] + round(1e9 * (offset_s + placed.measured_offset_s))
     with room_for(run.folder):
@@ -178,6 +180,7 @@ def _write_poses(run: FinishedRun, origin: Origin, T_enu_lidar: Poses) -> Geodet
     `GEODETIC` has a row for each localised scan, with the heading of its x axis clockwise from north.
     """
     trajectory = run.result.trajectory
+    (run.folder / FILE).unlink(missing_ok=True)  # of another origin; it is written last
     places = geodetic_from_enu(T_enu_lidar[:, :3, 3], origin)
     with whole_file(run.folder / ENU) as part:
         write_tum(part, trajectory.stamp_ns, T_enu_lidar)

@@ -1,9 +1,11 @@
 """A run on the globe: its files, and maps that other programs place where the fixes are."""
 
 import csv
+import errno
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as Xml
 
@@ -15,6 +17,7 @@ import rasterio
 from helpers.commands import run
 from helpers.finished_run import MadeRun, make_run
 from helpers.gnss_drive import ORIGIN, T_ENU_MAP, write_fixes, write_graph
+from helpers.gnss_drive import motions as chain_of
 from helpers.sessions import write_day
 from helpers.terminal import in_terminal
 from mcap.reader import make_reader
@@ -22,11 +25,15 @@ from mcap_protobuf.decoder import DecoderFactory
 from pyproj import Transformer
 
 from segslam.core import geometry
-from segslam.core.types import Points, SegslamError
+from segslam.core.types import Motion, MotionState, Points, SegslamError, WorkFailed
 from segslam.gnss import Origin, enu_from_geodetic, geodetic_from_enu
 from segslam.gnss.geodesy import utm
+from segslam.graph.g2o import G2oGraph, write_g2o
+from segslam.graph.noise import UNKNOWN_MOTION
+from segslam.output import georeferenced
 from segslam.output.export import export, track
-from segslam.output.folder import write_localised
+from segslam.output.finished import read_run
+from segslam.output.folder import ADJUSTED_GRAPH, write_localised
 from segslam.output.georeferenced import Globe, georeference, read_globe, recorded_fixes, take_over
 from segslam.output.log import read_log, schema
 from segslam.output.log.locations import write_locations
@@ -343,6 +350,44 @@ def test_only_localised_scans_are_in_a_track_and_in_a_map(made: MadeRun, tmp_pat
     assert not take_over(copy, made.folder), "no scan was localised"
     with pytest.raises(SegslamError, match="no keyframe of known pose has a static point"):
         export(copy, [copy / "b.ply"])
+
+
+def test_scans_before_a_break_do_not_follow_the_keyframe_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fixes show that the motion across the break is 3 m longer."""
+    made = make_run(tmp_path / "run")
+    finished, first = read_run(made.folder), 62  # a keyframe
+    trajectory, rows = finished.result.trajectory, finished.result.keyframe_rows
+    motions = [Motion(MotionState.BROKEN if row == first else MotionState.CONFIRMED) for row in range(len(trajectory))]
+    broken = replace(finished, result=replace(finished.result, motions=tuple(motions)))
+    monkeypatch.setattr(georeferenced, "read_run", lambda _: broken)
+    T_map_keyframe = trajectory.T_world_lidar[rows]
+    edges = chain_of(T_map_keyframe)
+    before = int(np.searchsorted(rows, first)) - 1
+    edges[before] = replace(edges[before], information=UNKNOWN_MOTION)
+    write_g2o(made.folder / ADJUSTED_GRAPH, G2oGraph(dict(enumerate(T_map_keyframe)), edges))
+    T_true = trajectory.T_world_lidar.copy()
+    T_true[first:, 0, 3] += 3.0
+    write_fixes(tmp_path / "fixes.csv", trajectory.stamp_ns, T_true, sigma_m=0.5)
+    georeference(made.folder, tmp_path / "fixes.csv")
+    off_m = _enu(_geodetic(made.folder)) - geometry.apply(T_ENU_MAP, T_true[:, :3, 3])
+    assert np.hypot(*off_m[:, :2].T).max() < 0.5
+
+
+def test_a_failure_leaves_no_poses_with_the_origin_of_an_earlier_place(
+    made: MadeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    folder = Path(shutil.copytree(made.folder, tmp_path / "run"))
+    trajectory = made.result.trajectory
+    write_fixes(tmp_path / "later.csv", trajectory.stamp_ns[30:], trajectory.T_world_lidar[30:])
+    monkeypatch.setattr(georeferenced, "write_locations", full)
+    with pytest.raises(WorkFailed, match="No space left on device"):
+        georeference(folder, tmp_path / "later.csv")
+    assert read_globe(folder) is None
 
 
 def test_a_place_is_refused_with_the_reason(made: MadeRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

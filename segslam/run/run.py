@@ -161,7 +161,8 @@ class Run:
 
         self._slam.resume(scan_of)
         self._log.move(recorded.path)
-        for name in (*ALONE_FILES, *PLACE_FILES):  # the state of KISS-ICP is lost, the place that of fewer scans
+        # the state of KISS-ICP is lost; place and report, which completes a run, are of fewer scans
+        for name in (*ALONE_FILES, *PLACE_FILES, "report.html"):
             (self.folder / name).unlink(missing_ok=True)
         self.num_scans_resumed = len(taken)
         self._started_mapping = perf_counter()

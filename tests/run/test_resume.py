@@ -198,14 +198,17 @@ def test_a_disk_without_room_for_a_scan_leaves_nothing_to_continue(
     assert not out.exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_results_without_disk_space_end_with_status_2_and_the_run_is_resumed(
     kitti: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Also if there are results of fewer scans, because the run was stopped before."""
+
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     out = _cut(whole, tmp_path / "run", log_bytes=boundaries(whole / "log.mcap")[-2])
+    (out / "report.html").write_text("of fewer scans")
     with monkeypatch.context() as patched:
         patched.setattr("segslam.output.folder.write_kitti", full)
         assert run("map", kitti, "--out", out, "--resume", *OPTIONS) == 2

@@ -41,12 +41,13 @@ def merge(
         check_new(out)
     changes.load()  # reports a wrong setting before the logs are read
     terminal.announce(f"merge: reading {counted(len(runs), 'run')}")
+    from segslam.run.replay import changed_config
     from segslam.run.sessions.merge import plan
     from segslam.run.sessions.recorded import read_sessions
 
     sessions = read_sessions(runs)
+    settings = changed_config(sessions[0].log, file=changes.config, settings=changes.overrides(), what="a merged run")
     terminal.compile_kernels()
-    settings = changes.load(base=sessions[0].run.config)
     with ExitStack() as stack:
         folder = make_folder(out, overwrite=changes.overwrite, inputs=runs)
         stack.callback(remove_if_empty, folder)

@@ -97,13 +97,15 @@ def read_log_with_steps(run: Path) -> RunLog:
     return recorded
 
 
-def changed_config(recorded: RunLog, *, file: Path | None = None, settings: Sequence[str] = ()) -> Config:
-    """The settings of a logged run with changes. Raises SegslamError for a change that would have no effect."""
+def changed_config(
+    recorded: RunLog, *, file: Path | None = None, settings: Sequence[str] = (), what: str = "a replay"
+) -> Config:
+    """The settings of a logged run with changes. Raises SegslamError for a change that would have no effect on `what`."""
     config = load_config(file, settings, base=recorded.config)
     for key, before, _ in changed_settings(recorded.config, config):
         if key.partition(".")[0] in BEFORE_THE_KEYFRAMES:
             raise SegslamError(
-                f"{key}: a replay uses the keyframes of {recorded.path}, which were made with {before}; "
+                f"{key}: {what} uses the keyframes of {recorded.path}, which were made with {before}; "
                 "keep this value, or map the data again"
             )
     return config

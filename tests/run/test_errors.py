@@ -86,6 +86,16 @@ def test_bad_usage_is_reported_in_one_line(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_setting_that_would_have_no_effect_in_a_merged_run_is_refused(
+    good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`locate` would correct scans by an angle by which those of the map were not corrected."""
+    other, setting = shutil.copytree(good, tmp_path / "other"), "sensor.vertical_angle_deg=3"
+    assert run("merge", good, other, "--out", tmp_path / "out", "--quiet", "--set", setting) == 2
+    assert "sensor.vertical_angle_deg: a merged run uses the keyframes of" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_what_is_in_the_new_folder_stays(good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = shutil.copytree(good, tmp_path / "other")
     (tmp_path / "out").mkdir()

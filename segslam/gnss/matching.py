@@ -1,5 +1,6 @@
 """Fixes matched to a drive: where the sensor was, by the trajectory, at the time of each fix."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,8 @@ class Drive:
     """(n, 4, 4) poses of the scans in the map."""
     keyframe_rows: Indices
     """(k,) row of each keyframe in the two."""
+    breaks: Sequence[int] = ()
+    """Rows of the keyframes after a motion that is almost unknown, ascending."""
 
     @property
     def T_map_keyframe(self) -> Poses:  # noqa: N802  (a transform)
@@ -45,7 +48,7 @@ class Matched:
     enu_m: Points
     """(n, 3) measured position, east, north, up; NaN for an unknown height."""
     keyframe: Indices
-    """(n,) the keyframe nearest in time."""
+    """(n,) the keyframe nearest in time without a break between."""
     T_map_lidar: Poses
     """(n, 4, 4) pose of the LiDAR in the map at the time of the fix."""
     T_keyframe_lidar: Poses
@@ -77,7 +80,9 @@ class Prepared:
         begin = int(drive.stamp_ns[0])
         time_s = 1e-9 * (stamps[rows] - begin)
         scan_s = 1e-9 * (drive.stamp_ns - begin)
-        keyframe = nearest_rows(scan_s[drive.keyframe_rows], time_s)
+        before = np.searchsorted(scan_s, time_s, side="right") - 1
+        part_s = 2.0 * (scan_s[-1] + 1.0) * np.searchsorted(drive.breaks, np.arange(len(scan_s)), side="right")
+        keyframe = nearest_rows((scan_s + part_s)[drive.keyframe_rows], time_s + part_s[before])
         T_map_lidar = interpolated(drive, scan_s, time_s)
         around_s = [np.clip(time_s + half_s, scan_s[0], scan_s[-1]) for half_s in (-SPEED_OVER_S / 2, SPEED_OVER_S / 2)]
         before, after = (

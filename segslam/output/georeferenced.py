@@ -65,7 +65,8 @@ def georeference(
     finished = read_run(run)
     known = fixes if isinstance(fixes, Fixes) else read_fixes(fixes)
     scans = finished.result.trajectory
-    drive = Drive(scans.stamp_ns, scans.T_world_lidar, finished.result.keyframe_rows)
+    breaks = [row for row, motion in enumerate(finished.result.motions) if motion.is_break]
+    drive = Drive(scans.stamp_ns, scans.T_world_lidar, finished.result.keyframe_rows, breaks)
     if in_map := finished.options.get("in_map"):
         raise SegslamError(
             f"{finished.folder}: localised in the map of {in_map}; georeference that run, and localise the data again"
@@ -76,7 +77,13 @@ def georeference(
             f"{graph}: missing, the run was made by an earlier version; `segslam replay` it into a new folder first"
         )
     placed = georeference_drive(read_g2o(graph).edges, drive, known, use=Use(use), offset_s=offset_s)
-    _write(finished, placed, Use(use), offset_s)
+    T_enu_lidar = corrected_poses(
+        drive.T_map_lidar,
+        drive.keyframe_rows,
+        placed.T_enu_keyframe,
+        after_break=np.isin(drive.keyframe_rows, breaks),
+    )
+    _write(finished, placed, T_enu_lidar, Use(use), offset_s)
     return placed
 
 
@@ -153,11 +160,8 @@ def recorded_fixes(folder: Path, *, stamp_shift_ns: int = 0) -> tuple[list[Row],
         return found, str(values.get("use", ""))
 
 
-def _write(run: FinishedRun, placed: Georeference, use: Use, offset_s: float) -> None:
+def _write(run: FinishedRun, placed: Georeference, T_enu_lidar: Poses, use: Use, offset_s: float) -> None:
     trajectory, fixes = run.result.trajectory, placed.fixes
-    rows = run.result.keyframe_rows
-    after_break = np.isin(rows, [row for row, motion in enumerate(run.result.motions) if motion.is_break])
-    T_enu_lidar = corrected_poses(trajectory.T_world_lidar, rows, placed.T_enu_keyframe, after_break=after_break)
     within = np.isfinite(placed.residual_m[:, 0])  # the drive
     measured_ns = fixes.stamp_ns[within] + round(1e9 * (offset_s + placed.measured_offset_s))
     with room_for(run.folder):

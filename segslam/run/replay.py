@@ -100,7 +100,7 @@ def read_log_with_steps(run: Path) -> RunLog:
 def changed_config(
     recorded: RunLog, *, file: Path | None = None, settings: Sequence[str] = (), what: str = "a replay"
 ) -> Config:
-    """The settings of a logged run with changes. Raises SegslamError for a change that would have no effect on `what`."""
+    """The settings of a logged run with changes. Raises SegslamError for a change without effect on `what`."""
     config = load_config(file, settings, base=recorded.config)
     for key, before, _ in changed_settings(recorded.config, config):
         if key.partition(".")[0] in BEFORE_THE_KEYFRAMES:

@@ -218,3 +218,13 @@ def test_fixes_that_contradict_each_other_are_refused() -> None:
         off[first : first + 6, :2] = rng.uniform(-400.0, 400.0, 2)
     with pytest.raises(SegslamError, match="fixes: the fixes contradict each other"):
         georeference(motions(truth), _drive(truth), _fixes(truth, off_m=off))
+
+
+def test_a_fix_belongs_to_a_keyframe_that_no_break_separates_from_it() -> None:
+    """A sensor stands for some seconds before a break: the keyframe after it is nearer in time, but elsewhere."""
+    stamp_ns = 1_000_000_000 * np.arange(10)
+    fixes = make_fixes("fixes", [Row(int(stamp), 48.0, 8.0 + 1e-6 * row) for row, stamp in enumerate(stamp_ns)])
+    drive = Drive(stamp_ns, np.tile(np.eye(4), (10, 1, 1)), np.array([0, 8]))
+    np.testing.assert_array_equal(prepare(fixes, drive).matched(0.0).keyframe, 5 * [0] + 5 * [1])
+    parted = replace(drive, breaks=[8])
+    np.testing.assert_array_equal(prepare(fixes, parted).matched(0.0).keyframe, 8 * [0] + 2 * [1])

@@ -37,7 +37,7 @@ class PoseSearch:
 
     def __init__(self, local: LocalMap, scan: SeenScan, *, prior: Prior = lambda fit: 0.0) -> None:
         """By default, any motion is as probable."""
-        self._local, self._scan, self._prior = local, scan, prior
+        self.local, self._scan, self._prior = local, scan, prior
         self._same_m = SEARCH_VOXELS_GICP[-1] * local.voxel_m
         self.far_m = SEARCH_VOXELS[0] * local.voxel_m
         """Distance that a registration reaches."""
@@ -61,7 +61,7 @@ class PoseSearch:
             for travel in TRAVELS
             for turn in TURNS
         ]
-        reached = [self._local.approach(self._scan, T_map_start) for T_map_start in starts]
+        reached = [self.local.approach(self._scan, T_map_start) for T_map_start in starts]
         found = [*known, *(self._with_prior(fit) for fit in reached if fit is not None)]
         found = self._compared(found, num_ordered=NUM_REGISTERED + len(known))
         others = [fit.T_map_lidar for fit in found if all(fit.T_map_lidar is not one.T_map_lidar for one in known)]
@@ -72,10 +72,10 @@ class PoseSearch:
 
         `recover` receives the newest scans of the map, as many as have `DENSE_VOXELS`.
         """
-        alignment = recover(self._scan.points, self._local.cloud(DENSE_VOXELS))
+        alignment = recover(self._scan.points, self.local.cloud(DENSE_VOXELS))
         if isinstance(alignment, Rejected):
             return []
-        return self._local.register(self._scan, alignment.fine.T_target_source)
+        return self.local.register(self._scan, alignment.fine.T_target_source)
 
     def elsewhere(self, fits: Sequence[Fit]) -> float:
         """Probability that a pose far from the most probable one is right instead; 1 without any pose."""
@@ -88,7 +88,7 @@ class PoseSearch:
         """Log odds that a pose is right, by the score of loops (nats)."""
         if fit.log_odds is not None:
             return fit.log_odds
-        return score.shipped().log_odds(patches.counts_at(self._scan.observed, self._local.observed, fit.T_map_lidar))
+        return score.shipped().log_odds(patches.counts_at(self._scan.observed, self.local.observed, fit.T_map_lidar))
 
     def log_ratio(self, fit: Fit, other: Fit) -> float:
         """How much more probable the scan makes a pose than another, whatever the last motions were (nats)."""
@@ -107,7 +107,7 @@ class PoseSearch:
         return covariance / total
 
     def _registered(self, starts: Iterable[Transform]) -> list[Fit]:
-        return [self._with_prior(fit) for T_map in starts for fit in self._local.register(self._scan, T_map)]
+        return [self._with_prior(fit) for T_map in starts for fit in self.local.register(self._scan, T_map)]
 
     def _with_prior(self, fit: Fit) -> Fit:
         return replace(fit, log_prior=self._prior(fit))

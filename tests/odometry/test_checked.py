@@ -19,12 +19,13 @@ from segslam.graph.graph import BREAK_LENGTH_M
 from segslam.graph.noise import odometry_information
 from segslam.labels.label_files import unlabelled
 from segslam.odometry import local_map
-from segslam.odometry.checked import CheckedOdometry, Proposed
+from segslam.odometry.checked import CheckedOdometry
 from segslam.odometry.kiss import KissOdometry
 from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, information_of
 from segslam.odometry.nudge import CHECK_VOXELS, nudge
+from segslam.odometry.scan_to_map import Proposed
 from segslam.odometry.search import PoseSearch, as_likely
 from segslam.odometry.sweep import GivenOdometry, OdometryResult
 from segslam.odometry.tracker import Tracker
@@ -308,12 +309,12 @@ def test_the_local_map_is_given_up_where_a_scan_is_more_probably_elsewhere(
     none = Rejected(RejectReason.HIGH_RESIDUAL)
     odometry = CheckedOdometry(_LikeKiss(truth, CONFIG.odometry), CONFIG, recover=lambda source, target: none)
     _registered(odometry, scans[:SLIP_AT])
-    monkeypatch.setattr(odometry, "_is_usual", lambda fits: False)
+    monkeypatch.setattr(odometry._scans, "_is_usual", lambda fits: False)
     monkeypatch.setattr(PoseSearch, "elsewhere", lambda search, fits: probability)
     motion = odometry.register(scans[SLIP_AT]).motion
     assert motion is not None
     assert motion.state is MotionState.BROKEN
-    assert (len(odometry._map) > 1) is is_kept
+    assert (len(odometry._scans.local) > 1) is is_kept
 
 
 def test_scans_of_a_few_points_move_on_as_before_though_the_odometry_aligns_them_elsewhere() -> None:
@@ -617,12 +618,12 @@ def test_a_scan_of_an_unusual_fit_is_searched_around_unless_its_score_is_good(
     odometry = _checked(truth.T_world_lidar)
     _registered(odometry, scans[:SLIP_AT])
     searched: list[object] = []
-    monkeypatch.setattr(odometry, "_is_usual", lambda fits: False)
+    monkeypatch.setattr(odometry._scans, "_is_usual", lambda fits: False)
     monkeypatch.setattr(PoseSearch, "log_odds", lambda *_: log_odds)
     monkeypatch.setattr(PoseSearch, "around", lambda search, *_: searched.append(search) or [])
     T_odom_lidar = geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[SLIP_AT]
     seen = SeenScan(scans[SLIP_AT].points, CONFIG.refine)
-    odometry._poses(_proposed(seen, T_odom_lidar))
+    odometry._scans._poses(_proposed(seen, T_odom_lidar))
     assert bool(searched) is is_searched
 
 
@@ -636,16 +637,16 @@ def test_a_fit_below_the_last_ones_is_searched_around_however_much_the_checks_va
     _registered(odometry, scans[:SLIP_AT])
     T_odom_lidar = geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[SLIP_AT]
     seen = SeenScan(scans[SLIP_AT].points, CONFIG.refine)
-    found = odometry._map.fit(seen, geometry.inverse(odometry._map.T_odom_map) @ T_odom_lidar)
-    odometry._last_fits.clear()
+    found = odometry._scans.local.fit(seen, geometry.inverse(odometry._scans.local.T_odom_map) @ T_odom_lidar)
+    odometry._scans._last_fits.clear()
     odometry._last_checks.clear()
     for sign in (-1.0, 1.0):
-        odometry._last_fits.append(found.mean_log + 1.0)
+        odometry._scans._last_fits.append(found.mean_log + 1.0)
         odometry._last_checks.append(sign * spread)
     searched: list[object] = []
     monkeypatch.setattr(PoseSearch, "log_odds", lambda *_: 1.0)
     monkeypatch.setattr(PoseSearch, "around", lambda search, *_: searched.append(search) or [])
-    odometry._poses(_proposed(seen, T_odom_lidar))
+    odometry._scans._poses(_proposed(seen, T_odom_lidar))
     assert len(searched) == 1
 
 
@@ -683,13 +684,13 @@ def test_a_registration_that_leads_away_from_its_start_is_compared_with_others(m
     scans, truth = round_drive()
     odometry = _checked(_slipped(metres=3.0))
     last = _registered(odometry, scans[:SLIP_AT])[-1]
-    usual = float(np.median(odometry._last_fits))
+    usual = float(np.median(odometry._scans._last_fits))
 
     before, now = truth.T_world_lidar[SLIP_AT - 1 : SLIP_AT + 1]
 
     def slides(search: PoseSearch, starts: object, known: object = ()) -> list[Fit]:
         beside = geometry.inverse(before) @ now @ geometry.transform(np.eye(3), [0.0, 2.0, 0.0])
-        fit = search._local.fit(search._scan, beside)
+        fit = search.local.fit(search._scan, beside)
         return [replace(fit, mean_log=usual - 2.0 * fit.num_patches**-0.5)]
 
     monkeypatch.setattr(PoseSearch, "near", slides)
@@ -704,12 +705,12 @@ def test_a_motion_is_unsure_by_the_distance_of_two_poses_that_explain_the_scan_a
     scans, truth = round_drive()
     odometry = _checked(_slipped(metres=3.0))
     _registered(odometry, scans[:SLIP_AT])
-    usual = float(np.median(odometry._last_fits))
+    usual = float(np.median(odometry._scans._last_fits))
     T_before_now = geometry.inverse(truth.T_world_lidar[SLIP_AT - 1]) @ truth.T_world_lidar[SLIP_AT]
 
     def two(search: PoseSearch, starts: object, known: object = ()) -> list[Fit]:
         places = [T_before_now @ geometry.transform(np.eye(3), [0.0, left_m, 0.0]) for left_m in (0.0, 1.2)]
-        fits = [search._local.fit(search._scan, T) for T in places]
+        fits = [search.local.fit(search._scan, T) for T in places]
         return [replace(fit, mean_log=usual, information=1e4 * np.eye(6)) for fit in fits]
 
     monkeypatch.setattr(PoseSearch, "near", two)
@@ -750,7 +751,7 @@ def test_a_motion_is_as_uncertain_in_each_direction_as_the_scan_or_the_model_whi
 def test_a_scan_that_shows_nothing_in_a_direction_is_as_unsure_there_as_one_that_nothing_explains() -> None:
     odometry = _checked(round_drive()[1].T_world_lidar)
     information = np.diag([0.0, 1e6, 1e6, 0.0, 1e6, 1e6])
-    covariance = odometry._covariance(Fit(np.eye(4), 0.0, 100, 1.0, 0.05, information))
+    covariance = odometry._scans.covariance(Fit(np.eye(4), 0.0, 100, 1.0, 0.05, information))
     sigma = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(sigma[[0, 3]], [np.radians(60.0), 30.0], rtol=1e-3)
     assert (sigma[[1, 2, 4, 5]] < 0.04).all()
@@ -1069,15 +1070,15 @@ def test_a_map_before_a_break_is_used_again_if_it_explains_the_scan_better(is_be
     scans, truth = round_drive()
     odometry = _checked(truth.T_world_lidar)
     last = _registered(odometry, scans[:SLIP_AT])[-1].T_odom_lidar
-    before, odometry._map = odometry._map, LocalMap(CONFIG.refine)
-    odometry._lost = before, odometry._motion.T_step, 1.0
+    before, odometry._scans.local = odometry._scans.local, LocalMap(CONFIG.refine)
+    odometry._scans._lost = before, odometry._motion.T_step, 1.0
     scan = SeenScan(scans[SLIP_AT].points, CONFIG.refine)
     T_odom_lidar = last @ geometry.inverse(truth.T_world_lidar[SLIP_AT - 1]) @ truth.T_world_lidar[SLIP_AT]
     there = before.register(scan, geometry.inverse(before.T_odom_map) @ T_odom_lidar)[0]
     here = replace(there, mean_log=there.mean_log + (-1.0 if is_better else 0.5) * there.num_patches**-0.5)
     proposed = _proposed(scan, T_odom_lidar)
-    assert (odometry._rejoined(proposed, [here]) is not None) is is_better
-    assert (odometry._map is before) is is_better
+    assert (odometry._scans._rejoined(proposed, [here]) is not None) is is_better
+    assert (odometry._scans.local is before) is is_better
 
 
 @pytest.mark.long
@@ -1090,15 +1091,15 @@ def test_a_map_before_a_break_is_found_again_where_the_motion_before_it_leads(nu
     scans, truth = round_drive()
     odometry = _checked(truth.T_world_lidar)
     last = _registered(odometry, scans[:SLIP_AT])[-1].T_odom_lidar
-    before, odometry._map = odometry._map, LocalMap(CONFIG.refine)
+    before, odometry._scans.local = odometry._scans.local, LocalMap(CONFIG.refine)
     T_step, T_last_true = (
         geometry.inverse(truth.T_world_lidar[SLIP_AT - 1]) @ truth.T_world_lidar[SLIP_AT - 1 + num]
         for num in (num_steps, 8)
     )
-    odometry._lost = before, T_step, 1.0
+    odometry._scans._lost = before, T_step, 1.0
     far_off = last @ geometry.transform(geometry.yaw(2.0), [0.0, -40.0, 0.0])
     scan = SeenScan(scans[SLIP_AT + 7].points, CONFIG.refine)
-    found = odometry._rejoined(_proposed(scan, far_off, gap), [])
+    found = odometry._scans._rejoined(_proposed(scan, far_off, gap), [])
     assert found is not None
     T_last_found = geometry.inverse(last) @ before.T_odom_map @ found[1][0].T_map_lidar
     assert geometry.distance(geometry.inverse(T_last_true) @ T_last_found) < 0.1

@@ -167,6 +167,7 @@ def _bar(items: Iterable[Item], total: int, title: str, num_before: int) -> Iter
             yield item
             if done > num_before:
                 bars.advance(task)
+        bars.update(task, total=bars.tasks[0].completed)  # fewer than `total` were needed
 
 
 def _lines(items: Iterable[Item], total: int, title: str, num_before: int) -> Iterator[Item]:

@@ -92,6 +92,14 @@ def test_a_bar_passes_all_items_on(monkeypatch: pytest.MonkeyPatch) -> None:
     assert list(Terminal().progress(iter(range(3)), total=3, title="count")) == [0, 1, 2]
 
 
+def test_a_bar_is_full_where_fewer_items_were_needed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert list(Terminal().progress(iter(range(3)), total=19, title="locate")) == [0, 1, 2]
+    assert "3/3" in capsys.readouterr().err
+
+
 def test_the_rate_is_that_of_this_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     seconds = iter([0.0, *([1.0] * 100), 11.0, 21.0])
     monkeypatch.setattr("segslam.cli.console.monotonic", lambda: next(seconds))

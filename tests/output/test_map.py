@@ -234,6 +234,19 @@ def _read_pgm(file: Path) -> np.ndarray:
     return np.frombuffer(rest, np.uint8).reshape(height, width)
 
 
+def test_a_picture_shows_the_whole_path_of_a_sensor_that_sees_only_far_ahead(tmp_path: Path) -> None:
+    keyframe, _ = next(iter(placed_keyframes()))
+    wall = np.stack([np.full(40, 40.0), np.linspace(-9, 9, 40), np.zeros(40)], axis=1).astype(np.float32)
+    ahead = replace(keyframe, points=wall, labels=np.full(40, Label.BUILDING, np.uint8), intensities=None)
+    placed = [(replace(ahead, id=row), geometry.transform(np.eye(3), [-20.0 * row, 0.0, 0.0])) for row in range(4)]
+    write_map(iter(placed), [tmp_path / "a.png"], config=CONFIG)
+    picture = np.rint(255 * imread(tmp_path / "a.png")[:, :, :3]).astype(int)
+    path = (np.abs(picture - list(bytes.fromhex(PATH[1:]))).max(axis=2) < 60)[:, :-LEGEND_PX].any(axis=0)
+    px_per_m = (picture.shape[1] - LEGEND_PX) / (100 + 2 * MARGIN_M)
+    assert np.flatnonzero(path)[0] > 1
+    assert np.ptp(np.flatnonzero(path)) == pytest.approx(60 * px_per_m, rel=0.1)
+
+
 def test_a_picture_of_ceilings_only_is_refused(tmp_path: Path) -> None:
     keyframe, _ = next(iter(placed_keyframes()))
     points = np.column_stack([np.random.default_rng(0).uniform(-5, 5, (4000, 2)), np.full(4000, 2.5)])

@@ -37,7 +37,8 @@ class Picture:
     def __init__(self, file: Path, store: "MapStore") -> None:
         self._file = file
         self._store = store
-        self._west, east, self._south, self._north = store.tiles.bounds()
+        tiles = np.vstack([list(store.tiles), np.floor(store.path_m[:, :2] / TILE_M)]).astype(np.int64)
+        (self._west, self._south), (east, self._north) = tiles.min(axis=0).tolist(), tiles.max(axis=0).tolist()
         columns, rows = east - self._west + 1, self._north - self._south + 1
         self._pixels = max(min(round(TILE_M / store.config.voxel_m), MAX_SIDE // max(columns, rows)), 1)
         size = rows * self._pixels, columns * self._pixels
@@ -67,10 +68,13 @@ class Picture:
         self._file.write_bytes(drawn_map(image, window, path_m=path_m, title=title, marks=self._marks()))
 
     def _finished(self) -> tuple[np.ndarray, Window, float]:
-        """The shaded image (rows, columns, 3) of what has points, its window, and the median height of its pixels."""
+        """The shaded image (rows, columns, 3) of points and path, its window, and the median height of its pixels."""
         known, margin = np.isfinite(self._height_m), round(MARGIN_M * self._pixels / TILE_M)
         if not known.any():
             raise SegslamError("map in top view: nothing is seen below the ceiling; write a cloud (.ply) instead")
+        west, south, _ = corner((self._west, self._south)).tolist()
+        column, row = ((self._store.path_m[:, :2] - (west, south)) / TILE_M * self._pixels).astype(np.int64).T
+        known[len(known) - 1 - row, column] = True  # the path is shown whole, also where the sensor saw nothing near it
         ends = (np.flatnonzero(known.any(axis=axis))[[0, -1]].tolist() for axis in (1, 0))
         (top, bottom), (left, right) = (
             (max(first - margin, 0), min(last + 1 + margin, size))
@@ -79,7 +83,6 @@ class Picture:
         area = np.s_[top:bottom, left:right]
         shading_px = max(round(SHADED_M * self._pixels / TILE_M), 3)
         image, height_m = closed_and_shaded(self._image[area], self._height_m[area], shading_px)
-        west, south, _ = corner((self._west, self._south)).tolist()
         pixel_m, height = TILE_M / self._pixels, len(known)
         east_west = west + left * pixel_m, west + right * pixel_m
         window = (*east_west, south + (height - bottom) * pixel_m, south + (height - top) * pixel_m)

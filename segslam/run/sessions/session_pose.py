@@ -74,7 +74,7 @@ def find_session(
             consistent = largest_consistent(graph.agreeing_pairs([shifted(one, first_id, 0) for one in found]))
             kept = [one for one, keep in zip(found, consistent, strict=True) if keep]
         if _is_enough(kept, session) or (likely is not None and not found and num_tried == MOST_FAILED):
-            break
+            queue.clear()
     if not _is_enough(kept, session):
         why = f"{MIN_CONSISTENT} are needed"
         if len(kept) >= MIN_CONSISTENT:

@@ -23,6 +23,7 @@ from segslam.cli.options import (
     Settings,
     with_options,
 )
+from segslam.cli.tables import aligned
 from segslam.core.errors import SegslamError
 from segslam.core.interrupts import EXIT_STATUS, when_stopped
 
@@ -265,7 +266,7 @@ def _experiment(
     from segslam.bench.experiments.pairs import PAPER_PAIR, pair_trials, scans_named
     from segslam.bench.experiments.paper import with_paper_values
     from segslam.bench.experiments.provenance import account
-    from segslam.bench.experiments.report_tables import overall, plain
+    from segslam.bench.experiments.report_tables import overall
     from segslam.bench.experiments.rows import results, write_rows
 
     scans, row_of_scan = open_once(job.source)
@@ -303,7 +304,8 @@ def _experiment(
         report = account(name, job, lists, found, options={**shared, **asked})
         write_bench_report(options.out, report, pictures=_pictures(job, trials, rows, options.draw))
         terminal.say(f"{options.out / 'report.html'}, report.md, report.json, details.csv")
-    terminal.answer(found, plain(overall(found)))
+    table = overall(found)
+    terminal.table(found, aligned([table.head, *table.rows]))
 
 
 def _pictures(job: "Job", trials: list["Trial"], rows: list["Row"], count: int) -> dict[str, bytes]:

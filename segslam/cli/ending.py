@@ -71,8 +71,8 @@ def finish(
         more=more, place=place, map_files=map_files, search_s=search_s, progress=terminal.progress
     )
     written = map_summary(metrics, map_files) if "map_seconds" in metrics else ""
-    texts = (summary(metrics, run.folder), vertical_angle_advice(metrics, run.config.sensor), placed, written)
-    terminal.answer(metrics, "\n".join(filter(None, texts)))
+    notes = vertical_angle_advice(metrics, run.config.sensor), placed, written
+    terminal.answer(metrics, summary(metrics, run.folder, notes=notes))
     return metrics
 
 
@@ -89,8 +89,8 @@ def map_summary(figures: dict[str, Any], files: Sequence[Path]) -> str:
     )
 
 
-def summary(metrics: dict[str, Any], folder: Path) -> str:
-    """The summary printed at the end of a run."""
+def summary(metrics: dict[str, Any], folder: Path, *, notes: Iterable[str] = ()) -> str:
+    """The summary printed at the end of a run; `notes`: texts above the lines that name the results."""
     length_m, seconds = metrics["length_m"], round(metrics["duration_s"])
     length = f"{length_m:.0f} m" if length_m < 10_000 else f"{length_m / 1000:.1f} km"
     lines = [
@@ -122,6 +122,7 @@ def summary(metrics: dict[str, Any], folder: Path) -> str:
     if "ate_m" not in metrics:
         follows = f"segslam eval {where} --reference POSES.txt"
     lines += [
+        *filter(None, notes),
         f"results in {folder}",
         f"report: {folder / 'report.html'} (open it in a browser)",
         f"next: {follows}; all commands: segslam --help",

@@ -49,7 +49,8 @@ LabelsOption = Annotated[
     str,
     typer.Option(
         autocompletion=completion.labels_or_files,
-        help="Labels: auto (labels/ if present, else geometric), none, geometric, network:MODEL.onnx, or a folder.",
+        help="Labels: auto (labels/ if present, else geometric), none, geometric, network:MODEL.onnx, or a folder (a "
+        "relative one starts beside the scans).",
     ),
 ]
 OverwriteOption = Annotated[bool, "Replace the run or the files that exist under this name."]

@@ -68,16 +68,22 @@ def as_latex(rows: Rows) -> str:
 
 
 def as_text(rows: Rows) -> str:
-    """The columns of `words.COLUMNS`, aligned; those that do not fit the terminal follow below."""
+    """The columns of `words.COLUMNS`."""
+    columns = _columns(rows)
+    lines = [[name, *(_cell(row.get(key)) for key in columns)] for name, row in rows.items()]
+    return aligned([["", *(COLUMNS[key] for key in columns)], *lines])
+
+
+def aligned(lines: Sequence[Sequence[str]]) -> str:
+    """Lines of cells, the first of each at the left; the columns that do not fit the terminal follow below."""
     within = shutil.get_terminal_size().columns
-    first = max(map(len, rows), default=4)
-    names = [f"{name:<{first}}" for name in ("", *rows)]
+    first, *columns = zip(*lines, strict=True)
+    names = [f"{name:<{max(map(len, first))}}" for name in first]
     parts = [names]
-    for key in _columns(rows):
-        width = max(len(COLUMNS[key]), 7)
+    for cells in columns:
+        width = max(7, *map(len, cells))
         if parts[-1] is not names and len(parts[-1][0]) + 2 + width > within:
             parts.append(names)
-        cells = (COLUMNS[key], *(_cell(row.get(key)) for row in rows.values()))
         parts[-1] = [f"{line}  {cell:>{width}}" for line, cell in zip(parts[-1], cells, strict=True)]
     return "\n\n".join("\n".join(lines) for lines in parts)
 

@@ -82,7 +82,8 @@ def open_labels(source: str, *, beside: Path, scan_names: Sequence[str], encodin
         return LabelSource(False, network=Network(expanded(source.removeprefix(NETWORK))))
     folder = beside / ("labels" if source == "auto" else expanded(source))
     if source != "auto" and not folder.is_dir():
-        raise SegslamError(f"--labels {source}: no folder {folder}; give one, auto, none, geometric or network:MODEL")
+        where = f"no folder {folder} (a relative path starts beside the scans)"
+        raise SegslamError(f"--labels {source}: {where}; give one, auto, none, geometric or network:MODEL")
     files = [file for name in scan_names if (file := folder / f"{name}.label").is_file()]
     if not files and source == "auto":
         return LabelSource(True)

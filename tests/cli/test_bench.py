@@ -65,6 +65,17 @@ def test_pairs_prints_the_figures_of_each_method_and_a_row_a_registration(
     assert len(rows) == 6
 
 
+def test_the_table_fits_the_terminal(
+    data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    quick = [option for option in QUICK if option != "--quiet"]
+    assert run("bench", "pairs", data, "--pairs", data / "pairs.txt", *quick) == 0
+    shown = capsys.readouterr().out.splitlines()  # where the tables of `eval` and `compare` are, too
+    assert max(map(len, shown)) <= 80
+    assert "p95 MB" in shown[-3]
+
+
 def test_a_list_can_be_cut_from_the_true_poses_and_sampled(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cut = ("--min-m", 0, "--max-m", 8, "--min-gap", 45)
     assert run("bench", "pairs", data, *cut, *QUICK, "--json") == 0

@@ -62,8 +62,9 @@ def test_map_writes_a_whole_run_and_skips_the_bad_scan(
 def test_the_end_of_map_leads_on(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Length and duration, the error by stage, the report, the next command; also of a replay."""
     out = tmp_path / "my run"
-    assert run("map", kitti, "--out", out) == 0
+    assert run("map", kitti, "--out", out, "--map-file", "grid.yaml") == 0
     shown = capsys.readouterr().err
+    assert shown.splitlines()[-1].startswith("next: "), "below the lines about the map"
     metrics = json.loads((out / "metrics.json").read_text())
     for text in (
         f"drive: {metrics['length_m']:.0f} m in 3 s",

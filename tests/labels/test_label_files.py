@@ -99,7 +99,7 @@ def test_an_invalid_file_does_not_prevent_detection_of_the_encoding(tmp_path: Pa
 
 
 def test_missing_folder_and_unknown_source_are_named(tmp_path: Path) -> None:
-    with pytest.raises(SegslamError, match=r"--labels predicted: no folder .*predicted; give one, auto"):
+    with pytest.raises(SegslamError, match=r"predicted \(a relative path starts beside the scans\); give one"):
         open_labels("predicted", beside=tmp_path, scan_names=NAMES, encoding=None)
 
 

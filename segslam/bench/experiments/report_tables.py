@@ -69,16 +69,6 @@ def html(table: Table) -> str:
     return f"<table>{_html_row('th', table.head)}{rows}</table>"
 
 
-def plain(table: Table) -> str:
-    """The table as aligned text for a terminal."""
-    lines = [table.head, *table.rows]
-    widths = [max(len(cells[column]) for cells in lines) for column in range(len(table.head))]
-    return "\n".join(
-        "  ".join([cells[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(cells[1:], widths[1:], strict=True))])
-        for cells in lines
-    )
-
-
 def text(value: float | None) -> str:
     """A number as text; a dash for None."""
     return "-" if value is None else number(value)

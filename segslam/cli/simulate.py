@@ -1,7 +1,7 @@
 """`segslam simulate` and `demo`: drives through a simulated street."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -33,12 +33,7 @@ def simulate(
     ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Number of scans; default: the whole drive.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed; the same seed gives the same scans.")] = 0,
-    sensor: Annotated[
-        str,
-        typer.Option(
-            autocompletion=lambda: ("hdl64", "os1-64", "vlp16"), help="Sensor: hdl64 (as in KITTI), os1-64 or vlp16."
-        ),
-    ] = "hdl64",
+    sensor: Annotated[Literal["hdl64", "os1-64", "vlp16"], "Sensor; hdl64 is that of KITTI."] = "hdl64",
     lane: Annotated[
         float, typer.Option(min=-4, max=4, help="Offset to the left of the path (m); negative: to the right.")
     ] = 0.0,

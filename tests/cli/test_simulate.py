@@ -43,7 +43,7 @@ def test_it_follows_a_pose_file(tmp_path):
     ("arguments", "complaint"),
     [
         (("--frames", 0), "frames"),
-        (("--sensor", "sonar"), "sensor.name"),
+        (("--sensor", "sonar"), "Invalid value for '--sensor'"),
         (("--poses", "missing.txt"), "missing.txt"),
         (("--seed", -1), "seed"),
         (("--set", "world.cars=99"), "world.cars"),

@@ -126,4 +126,4 @@ def fleet(
             facts.append(f"{counted(component.get('num_loops_between', 0), 'loop')} between them")
         facts += [f"error {component['ate_m']:.3f} m"] if "ate_m" in component else []
         terminal.say(f"component {number}: {'; '.join(facts)}")
-    terminal.say(f"report: {result.folder / 'report.html'}")
+    terminal.say(f"report: {out / 'report.html'} (open it in a browser)")

@@ -216,7 +216,8 @@ def one_topic(recording: Path, known: Collection[str], wanted: str, *, kinds: Se
     found = [name for name in known if name == wanted or not wanted]
     if len(found) != 1:
         topics = ", ".join(f"{option} {name}" for name in sorted(known)) or "none"
-        raise SegslamError(f"{recording}: give one topic of type {' or '.join(kinds)}; the recording has: {topics}")
+        asked = f"no topic {wanted}" if wanted else "give one topic"
+        raise SegslamError(f"{recording}: {asked} of type {' or '.join(kinds)}; the recording has: {topics}")
     return found[0]
 
 

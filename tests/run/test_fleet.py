@@ -326,8 +326,10 @@ def test_a_component_of_one_drive_is_shown_without_loops(
     alone, two = {"drives": ["a"], "ate_m": 0.0041}, {"drives": ["b", "c"], "num_loops_between": 3}
     result = FleetResult(tmp_path, {}, (alone, two), {})
     monkeypatch.setattr(segslam.run.fleets.orchestrate, "fleet", lambda *_, **__: result)
-    assert run("fleet", recordings[0], "--out", tmp_path / "city") == 0
+    monkeypatch.chdir(tmp_path)
+    assert run("fleet", recordings[0], "--out", "city") == 0
     shown = capsys.readouterr().err
+    assert shown.endswith("report: city/report.html (open it in a browser)\n")
     assert "component 0: a; error 0.004 m\ncomponent 1: b, c; 3 loops between them\n" in shown
 
 

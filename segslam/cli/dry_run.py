@@ -78,7 +78,7 @@ def lines(found: dict[str, Any]) -> str:
 def _times(scan: dict[str, Any]) -> str:
     """How the times of the points are understood."""
     if not scan["has_times"]:
-        return "none, points are assumed to be motion-compensated"
+        return "none, so the odometry does not compensate the motion within a sweep"
     if scan["sweep_s"] is None:
         return "a sweep from scan to scan"
     return f"a sweep of {scan['sweep_s']:.3f} s, poses at {scan['stamp_time'] * scan['sweep_s']:.3f} s of it"

@@ -109,6 +109,7 @@ def test_a_dry_run_shows_what_was_found_and_writes_nothing(
     shown = capsys.readouterr().out
     assert "6 scans, 2 to 7" in shown
     assert "degrees, +0.205 of correction; point times" in shown  # that of KITTI's layout
+    assert "point times: none, so the odometry does not compensate the motion" in shown
     assert list(tmp_path.iterdir()) == []
 
 

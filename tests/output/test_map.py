@@ -238,13 +238,13 @@ def test_a_picture_shows_the_whole_path_of_a_sensor_that_sees_only_far_ahead(tmp
     keyframe, _ = next(iter(placed_keyframes()))
     wall = np.stack([np.full(40, 40.0), np.linspace(-9, 9, 40), np.zeros(40)], axis=1).astype(np.float32)
     ahead = replace(keyframe, points=wall, labels=np.full(40, Label.BUILDING, np.uint8), intensities=None)
-    placed = [(replace(ahead, id=row), geometry.transform(np.eye(3), [-20.0 * row, 0.0, 0.0])) for row in range(4)]
+    placed = [(replace(ahead, id=row), geometry.transform(np.eye(3), [-16.0 * row, 0.0, 0.0])) for row in range(5)]
     write_map(iter(placed), [tmp_path / "a.png"], config=CONFIG)
     picture = np.rint(255 * imread(tmp_path / "a.png")[:, :, :3]).astype(int)
     path = (np.abs(picture - list(bytes.fromhex(PATH[1:]))).max(axis=2) < 60)[:, :-LEGEND_PX].any(axis=0)
-    px_per_m = (picture.shape[1] - LEGEND_PX) / (100 + 2 * MARGIN_M)
-    assert np.flatnonzero(path)[0] > 1
-    assert np.ptp(np.flatnonzero(path)) == pytest.approx(60 * px_per_m, rel=0.1)
+    px_per_m = (picture.shape[1] - LEGEND_PX) / (104 + 2 * MARGIN_M)
+    assert np.flatnonzero(path)[0] > 0.5 * MARGIN_M * px_per_m, "a margin, though the path ends where a tile does"
+    assert np.ptp(np.flatnonzero(path)) == pytest.approx(64 * px_per_m, rel=0.1)
 
 
 def test_a_picture_of_ceilings_only_is_refused(tmp_path: Path) -> None:

@@ -37,7 +37,8 @@ class Picture:
     def __init__(self, file: Path, store: "MapStore") -> None:
         self._file = file
         self._store = store
-        tiles = np.vstack([list(store.tiles), np.floor(store.path_m[:, :2] / TILE_M)]).astype(np.int64)
+        beside = (store.path_m[:, :2] + margin_m for margin_m in (-MARGIN_M, MARGIN_M))
+        tiles = np.vstack([list(store.tiles), *(np.floor(xy_m / TILE_M) for xy_m in beside)]).astype(np.int64)
         (self._west, self._south), (east, self._north) = tiles.min(axis=0).tolist(), tiles.max(axis=0).tolist()
         columns, rows = east - self._west + 1, self._north - self._south + 1
         self._pixels = max(min(round(TILE_M / store.config.voxel_m), MAX_SIDE // max(columns, rows)), 1)

@@ -99,8 +99,13 @@ class Nearness:
     covariances: Float[np.ndarray, "k 6 6"]
     distance_m: Vector
     """Horizontal distance."""
+    same_height: Vector
+    """Probability that an error of the estimate makes the heights differ by more than those of two visits of a place.
+
+    It is 1 if they do not differ by more, and small on another storey.
+    """
     probability: Vector
-    """Probability that the two are within the radius; 0 on another storey."""
+    """Probability that the two are within the radius, and not on different storeys."""
     reach_m: Vector
     """Largest distance that is probably within the radius."""
 
@@ -138,9 +143,10 @@ def nearness(
     along_m, across_m = (
         np.sqrt(np.maximum(np.einsum("ki,kij,kj->k", way, spread[:, :2, :2], way), 1e-12)) for way in (ahead, aside)
     )
-    height_m = np.sqrt(np.maximum(spread[:, 2, 2], 0.0))
+    height_m = np.sqrt(np.maximum(spread[:, 2, 2], 1e-12))
     probability = ndtr((radius_m - distance_m) / along_m) - ndtr((-radius_m - distance_m) / along_m)
     probability *= 2.0 * ndtr(radius_m / across_m) - 1.0
-    probability[np.abs(offset[:, 2]) > HEIGHT_M + FARTHEST * height_m] = 0.0
+    same_height = np.minimum(1.0, 2.0 * ndtr((HEIGHT_M - np.abs(offset[:, 2])) / height_m))
+    probability *= same_height
     reach_m = radius_m + FARTHEST * np.maximum(along_m, across_m)
-    return Nearness(source_id, ids, T_world_keyframes, found, distance_m, probability, reach_m)
+    return Nearness(source_id, ids, T_world_keyframes, found, distance_m, same_height, probability, reach_m)

@@ -225,11 +225,16 @@ class CheckedOdometry:
         )
 
     def _own_information(self, covariance: Information) -> Information | None:
-        """Information of a motion that is less certain than the graph's noise model of odometry; else None."""
+        """Information of a motion that is less certain than the graph's noise model of odometry; else None.
+
+        The model grows by as much as the covariance exceeds it and the errors that all points share: those of two scans
+        in a row are nearly the same, so that they hardly add up.
+        """
         step = geometry.transform(np.eye(3), np.array([self._config.keyframes.distance_m, 0.0, 0.0]))
-        model = np.linalg.inv(odometry_information(0.0, step, self._config.graph)) + SHARED_NOISE
-        whiten = np.diag(np.diag(model) ** -0.5)
-        excess, directions = np.linalg.eigh(whiten @ (covariance - model) @ whiten)
+        model = np.linalg.inv(odometry_information(0.0, step, self._config.graph))
+        usual = model + SHARED_NOISE
+        whiten = np.diag(np.diag(usual) ** -0.5)
+        excess, directions = np.linalg.eigh(whiten @ (covariance - usual) @ whiten)
         if excess[-1] <= 0.0:
             return None
         half = np.linalg.inv(whiten) @ directions

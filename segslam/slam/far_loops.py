@@ -5,6 +5,7 @@ A loop is closed only if several keyframes confirm it (`Confirmation`).
 
 import math
 from collections.abc import Callable, Collection, Sequence
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -102,7 +103,8 @@ class FarLoops:
         near = self._nearness(keyframe_id, ids)
         drift_m = (MOST_DRIFT * (travel_m[keyframe_id] - travel_m[near.ids])).tolist()
         loops = map(_FarLoop, map(near.candidate, range(len(ids))), drift_m, near.reach_m.tolist())
-        return next((loop for loop in loops if loop.is_left), None)
+        is_here = (near.same_height >= LEAST_PROBABILITY).tolist()  # storeys look the same
+        return next((loop for loop in compress(loops, is_here) if loop.is_left), None)
 
     def candidate(self, keyframe_id: int, target_id: int) -> LoopCandidate:
         """A loop between these two."""

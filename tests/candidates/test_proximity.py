@@ -108,6 +108,17 @@ def test_another_storey_is_not_proposed() -> None:
         assert bool(found_by(ROUND + 12, poses, travel)) is is_proposed, height
 
 
+def test_the_higher_a_place_seems_to_be_the_less_probable_it_is() -> None:
+    """By the chance that an error of the height explains what is beyond 1 m."""
+    chances = []
+    for height in (0.9, 1.5, 2.0):
+        poses = np.stack([np.eye(4), geometry.transform(np.eye(3), [2.0, 0.0, height])])
+        near = nearness(1, np.array([0]), poses, lambda *_: 0.25 * np.eye(6)[None], radius_m=6.0)
+        assert near.probability[0] == pytest.approx(near.same_height[0], abs=1e-6)
+        chances.append(near.same_height[0])
+    assert chances == pytest.approx([1.0, 0.3173, 0.0455], abs=1e-4)
+
+
 def test_a_place_out_of_the_radius_is_proposed_as_far_as_the_drift_makes_it_probable() -> None:
     for sigma_m, distance_m, is_proposed in (
         (0.8, 7.5, True),

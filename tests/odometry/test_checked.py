@@ -720,32 +720,45 @@ def test_a_motion_is_unsure_by_the_distance_of_two_poses_that_explain_the_scan_a
     assert np.sqrt(np.diag(motion.covariance)[3:]) == pytest.approx([0.0, 1.2 / np.sqrt(2.0), 0.0], abs=0.1)
 
 
-def test_a_motion_has_information_of_its_own_if_it_is_less_certain_than_the_model() -> None:
+def _model_and_shared() -> tuple[np.ndarray, np.ndarray]:
+    """Covariances (6, 6) of a motion by the graph's noise of odometry, and of the errors that all points share."""
     step = geometry.transform(np.eye(3), np.array([CONFIG.keyframes.distance_m, 0.0, 0.0]))
     shared = geometry.tangent(rotation_rad=np.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M)
-    model = np.linalg.inv(odometry_information(0.0, step, CONFIG.graph)) + np.diag(shared**2)
+    return np.linalg.inv(odometry_information(0.0, step, CONFIG.graph)), np.diag(shared**2)
+
+
+def test_a_motion_has_information_of_its_own_if_it_is_less_certain_than_the_model() -> None:
+    model, shared = _model_and_shared()
     odometry = _checked(round_drive()[1].T_world_lidar)
-    assert odometry._own_information(0.5 * model) is None
-    own = odometry._own_information(4.0 * model)
+    assert odometry._own_information(0.5 * (model + shared)) is None
+    own = odometry._own_information(4.0 * (model + shared))
     assert own is not None
-    np.testing.assert_allclose(own @ (4.0 * model), np.eye(6), atol=1e-6)
-    along = 0.5 * model + np.diag([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])  # the scan shows all but the motion along one axis
+    np.testing.assert_allclose(own @ (4.0 * model + 3.0 * shared), np.eye(6), atol=1e-6)
+    along = 0.5 * (model + shared) + np.diag([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])  # the scan shows all but one axis
     own = odometry._own_information(along)
     assert own is not None
     assert np.linalg.inv(own)[3, 3] == pytest.approx(1.0, rel=0.1)
 
 
-def test_a_motion_is_as_uncertain_in_each_direction_as_the_scan_or_the_model_whichever_is_more() -> None:
-    """Directions in which both rotation and translation are uncertain: their variances relative to the model's."""
+def test_the_information_of_a_motion_has_no_jump_where_it_becomes_less_certain_than_the_model() -> None:
+    """Errors that the points of two scans share hardly add up, so that they are no part of it."""
+    model, shared = _model_and_shared()
     odometry = _checked(round_drive()[1].T_world_lidar)
-    step = geometry.transform(np.eye(3), np.array([CONFIG.keyframes.distance_m, 0.0, 0.0]))
-    shared = geometry.tangent(rotation_rad=np.radians(SHARED_NOISE_DEG), translation_m=SHARED_NOISE_M)
-    model = np.linalg.inv(odometry_information(0.0, step, CONFIG.graph)) + np.diag(shared**2)
+    own = odometry._own_information(1.001 * (model + shared))
+    assert own is not None
+    np.testing.assert_allclose(np.sqrt(np.diag(np.linalg.inv(own))), np.sqrt(np.diag(model)), rtol=0.01)
+
+
+def test_a_motion_is_as_uncertain_in_each_direction_as_the_scan_or_the_model_whichever_is_more() -> None:
+    """Directions in which both rotation and translation are uncertain: their variances relative to the usual ones."""
+    model, shared = _model_and_shared()
+    odometry = _checked(round_drive()[1].T_world_lidar)
     turn = np.linalg.qr(np.random.default_rng(0).standard_normal((6, 6)))[0]
-    root = np.sqrt(model) @ turn
+    root = np.sqrt(model + shared) @ turn
     own = odometry._own_information(root @ np.diag([9.0, 4.0, 1.0, 0.5, 0.1, 0.01]) @ root.T)
     assert own is not None
-    np.testing.assert_allclose(eigh(np.linalg.inv(own), model, eigvals_only=True), [1.0] * 4 + [4.0, 9.0], rtol=1e-6)
+    more = eigh(np.linalg.inv(own) - model, model + shared, eigvals_only=True)
+    np.testing.assert_allclose(more, [0.0] * 4 + [3.0, 8.0], atol=1e-6)
 
 
 def test_a_scan_that_shows_nothing_in_a_direction_is_as_unsure_there_as_one_that_nothing_explains() -> None:

@@ -247,6 +247,26 @@ def test_a_loop_that_waits_after_the_search_by_distance_is_not_tried_by_appearan
     assert len(closed) == len(set(closed))
 
 
+@pytest.mark.parametrize(("height_m", "is_tried"), [(0.5, True), (3.0, False)])
+def test_a_place_that_looks_the_same_on_another_storey_is_not_tried(height_m: float, is_tried: bool) -> None:
+    """The second round of 120 m is 13 m beside the first by the odometry."""
+    config = load_config(None)
+    graph = PoseGraph(config.graph)
+    no_points = np.zeros((0, 3), np.float32), np.zeros(0, np.uint8)
+    closer = LoopCloser(config, graph, lambda _: no_points, lambda _: no_points[1], NO_EDITS, is_known=False)
+    rng = np.random.default_rng(1)
+    seen = [rng.integers(0, 255, 24 * 60, dtype=np.uint8).tobytes() for _ in range(60)]
+    for number in range(90):
+        angle = 2.0 * np.pi * number / 60
+        at = [19.0 * np.cos(angle), 19.0 * np.sin(angle) + 13.0 * (number >= 60), height_m * (number >= 60)]
+        T_odom = geometry.transform(geometry.yaw(angle), at)
+        graph.add_keyframe(number, T_odom, 2.0 * number)
+        closer.add(T_odom, labelled_by_shape=False, recorded=seen[number % 60])
+    loop = closer._far._loop(89, closer._far._signatures[89])
+    assert (loop is not None) is is_tried
+    assert loop is None or loop.candidate.target_id == 29
+
+
 @pytest.mark.parametrize("is_near", [True, False])
 def test_of_known_drives_scans_are_described_only_for_loops_that_are_not_near_the_known_pose(
     is_near: bool, monkeypatch: pytest.MonkeyPatch

@@ -100,10 +100,7 @@ class Nearness:
     distance_m: Vector
     """Horizontal distance."""
     same_height: Vector
-    """Probability that an error of the estimate makes the heights differ by more than those of two visits of a place.
-
-    It is 1 if they do not differ by more, and small on another storey.
-    """
+    """Probability that the heights differ by an error of the estimate: 1 up to `HEIGHT_M`, little on another storey."""
     probability: Vector
     """Probability that the two are within the radius, and not on different storeys."""
     reach_m: Vector

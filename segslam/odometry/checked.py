@@ -227,8 +227,8 @@ class CheckedOdometry:
     def _own_information(self, covariance: Information) -> Information | None:
         """Information of a motion that is less certain than the graph's noise model of odometry; else None.
 
-        The model grows by as much as the covariance exceeds it and the errors that all points share: those of two scans
-        in a row are nearly the same, so that they hardly add up.
+        The model grows by as much as the covariance exceeds it and the errors that all points share. So it has no jump:
+        a motion that is as certain as usual has the model alone, whatever the points share.
         """
         step = geometry.transform(np.eye(3), np.array([self._config.keyframes.distance_m, 0.0, 0.0]))
         model = np.linalg.inv(odometry_information(0.0, step, self._config.graph))

@@ -4,12 +4,12 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from segslam.core.config import Config
-from segslam.core.errors import counted, unreadable
+from segslam.core.errors import brief, counted, unreadable
 from segslam.core.pose_files import PoseFormat, read_poses
 from segslam.core.trajectory import lidar_from_camera, rows_of_same_stamp
 from segslam.core.types import LoopAttempt, Motion, SegslamError, Trajectory, Transform
@@ -55,6 +55,28 @@ class FinishedRun:
         from segslam.output.report import as_html
 
         return as_html(self)
+
+
+class Part(NamedTuple):
+    """A session in a merged run."""
+
+    first_keyframe: int
+    num_scans: int
+    stamp_shift_ns: int = 0
+    """Its stamps are later by this than those of its data."""
+    run: str = ""
+    """Its folder."""
+
+
+def parts_in(text: str) -> list[Part]:
+    """The sessions in the options of a log; none if it is not of merged runs. Raises SegslamError if it is damaged."""
+    try:
+        return [
+            Part(int(row["first_keyframe"]), int(row["num_scans"]), int(row["stamp_shift_ns"]), str(row["run"]))
+            for row in json.loads(text or "[]")
+        ]
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
+        raise SegslamError(f"sessions of the log: {brief(text)} cannot be read; merge the runs again") from error
 
 
 def read_run(folder: str | Path) -> FinishedRun:
@@ -127,7 +149,7 @@ def true_poses(
         rows, numbers = scans.scan_index, np.arange(len(scans))
         if run.T_camera_lidar is not None:
             T_world_lidar = lidar_from_camera(T_world_lidar, run.T_camera_lidar)
-    elif shifted := [one["run"] for one in json.loads(run.options.get("sessions", "[]")) if one["stamp_shift_ns"]]:
+    elif shifted := [part.run for part in parts_in(run.options.get("sessions", "")) if part.stamp_shift_ns]:
         raise SegslamError(
             f"{file}: matched by stamp, but the merged run has other stamps than {shifted[0]}; score each run, or give "
             "KITTI format, one line per scan"

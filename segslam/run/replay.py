@@ -13,12 +13,11 @@ from segslam.core.config import Config, ProximityConfig, changed_settings, load_
 from segslam.core.trajectory import travelled_m
 from segslam.core.types import SegslamError, Vector
 from segslam.core.whole_files import expanded
-from segslam.output.finished import FinishedRun, read_run
+from segslam.output.finished import FinishedRun, parts_in, read_run
 from segslam.output.folder import copy_alone, new_folder
 from segslam.output.georeferenced import FILE, read_globe
 from segslam.output.log import Mirror, RunLog, read_log
 from segslam.run.run import Run
-from segslam.run.sessions.recorded import parts_in
 from segslam.slam.loop_edits import NO_EDITS, LoopEdits, Pair
 from segslam.slam.slam import Slam
 

@@ -26,7 +26,7 @@ from segslam.core.types import BadScan, CloudOf, MotionState, Scan, SegslamError
 from segslam.core.whole_files import settle, write_whole
 from segslam.graph import PoseGraph
 from segslam.output.accuracy import accuracy
-from segslam.output.finished import read_metrics
+from segslam.output.finished import parts_in, read_metrics
 from segslam.output.folder import (
     ADJUSTED_GRAPH,
     ALONE,
@@ -42,7 +42,7 @@ from segslam.output.folder import (
     write_poses,
 )
 from segslam.output.log import LogWriter, Mirror, RunLog, read_log
-from segslam.run.sessions.recorded import figures_of, parts_in
+from segslam.run.sessions.recorded import figures_of
 from segslam.scans import Dataset
 from segslam.slam.adjustment.vertical_angle import measure_vertical_angle
 from segslam.slam.slam import Slam, SlamResult, Tracked

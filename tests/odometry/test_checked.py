@@ -741,7 +741,7 @@ def test_a_motion_has_information_of_its_own_if_it_is_less_certain_than_the_mode
 
 
 def test_the_information_of_a_motion_has_no_jump_where_it_becomes_less_certain_than_the_model() -> None:
-    """Errors that the points of two scans share hardly add up, so that they are no part of it."""
+    """Errors that all points share are no part of it."""
     model, shared = _model_and_shared()
     odometry = _checked(round_drive()[1].T_world_lidar)
     own = odometry._own_information(1.001 * (model + shared))

@@ -75,7 +75,8 @@ def test_kitti_truth_of_another_length_than_all_the_data_is_refused(tmp_path: Pa
 def test_truth_of_a_drive_is_not_that_of_scans_with_other_numbers_and_stamps_in_a_merged_run(tmp_path: Path) -> None:
     """The numbers and stamps of the second session of a merged run belong to other scans of a longer drive."""
     run = read_run(make_run(tmp_path / "run", with_truth=False).folder)
-    rows = [{"run": "monday", "stamp_shift_ns": 0}, {"run": "friday", "stamp_shift_ns": 10**9}]
+    of_both = {"first_keyframe": 0, "num_scans": NUM_SCANS}
+    rows = [{"run": "monday", "stamp_shift_ns": 0} | of_both, {"run": "friday", "stamp_shift_ns": 10**9} | of_both]
     merged = replace(run, options={"sessions": json.dumps(rows)})
     poses = np.tile(np.eye(4), (FIRST_SCAN + NUM_SCANS + 30, 1, 1))
     write_kitti(tmp_path / "kitti.txt", poses)
@@ -88,6 +89,8 @@ def test_truth_of_a_drive_is_not_that_of_scans_with_other_numbers_and_stamps_in_
         true_poses(tmp_path / "tum.txt", merged)
     later = replace(run, options={"sessions": json.dumps(rows[:1])})
     assert len(true_poses(tmp_path / "tum.txt", later)) == NUM_SCANS, "no stamp was shifted"
+    with pytest.raises(SegslamError, match=r"sessions of the log: .* cannot be read"):
+        true_poses(tmp_path / "tum.txt", replace(run, options={"sessions": "[{}]"}))
 
 
 def test_tum_truth_is_found_by_stamp(tmp_path: Path) -> None:

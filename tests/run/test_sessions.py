@@ -21,14 +21,14 @@ from segslam.core.config import Config, load_config
 from segslam.core.evaluation import align_positions
 from segslam.core.types import LoopClosure, MotionState, Trajectory
 from segslam.gnss import enu_from_geodetic
-from segslam.output.finished import FinishedRun, read_run
+from segslam.output.finished import FinishedRun, Part, read_run
 from segslam.output.log import read_log
 from segslam.output.map import picture
 from segslam.output.report import comparison, figures
 from segslam.output.report.loops import top_view
 from segslam.run.sessions import merge
 from segslam.run.sessions.merge import arranged
-from segslam.run.sessions.recorded import Part, SessionPose, figures_of, read_sessions
+from segslam.run.sessions.recorded import SessionPose, figures_of, read_sessions
 from segslam.slam.loop_edits import LoopEdits
 from segslam.slam.slam import Slam
 

@@ -1,14 +1,13 @@
 """A finished run as one session of a merged run: keyframes, steps with new numbers, and figures of such a run."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from segslam.core.errors import brief, counted
+from segslam.core.errors import counted
 from segslam.core.trajectory import Poses, travelled_m
 from segslam.core.types import (
     REJECTED_WEIGHT,
@@ -23,7 +22,7 @@ from segslam.core.types import (
     Transform,
     Vector,
 )
-from segslam.output.finished import FinishedRun, read_corrections, read_run
+from segslam.output.finished import FinishedRun, Part, read_corrections, read_run
 from segslam.output.folder import log_of
 from segslam.output.log import RunLog, read_log
 from segslam.slam.adjustment.alignment import MIN_PAIRS
@@ -163,21 +162,6 @@ def _shifted(attempt: LoopAttempt, shift: int) -> LoopAttempt:
         candidate=replace(candidate, source_id=candidate.source_id + shift, target_id=candidate.target_id + shift),
         outcome=shifted(outcome, shift, shift) if isinstance(outcome, LoopClosure) else outcome,
     )
-
-
-class Part(NamedTuple):
-    """A session in a merged run."""
-
-    first_keyframe: int
-    num_scans: int
-
-
-def parts_in(text: str) -> list[Part]:
-    """The sessions in the options of a log; none if it is not of merged runs. Raises SegslamError if it is damaged."""
-    try:
-        return [Part(int(row["first_keyframe"]), int(row["num_scans"])) for row in json.loads(text or "[]")]
-    except (ValueError, TypeError, KeyError, OverflowError) as error:
-        raise SegslamError(f"sessions of the log: {brief(text)} cannot be read; merge the runs again") from error
 
 
 def figures_of(sessions: Sequence[Part], result: SlamResult) -> dict[str, Any]:

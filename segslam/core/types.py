@@ -228,9 +228,9 @@ class MotionState(StrEnum):
     """Result of checking a motion against the scans."""
 
     UNCHECKED = "unchecked"
-    """Not checked: too little motion since the last check."""
+    """Not checked: the first scan, one of too few points, or a motion of other sensors that the scan does not show."""
     CONFIRMED = "confirmed"
-    """The motion of the odometry, consistent with the scans."""
+    """The motion of other sensors, consistent with the scan."""
     REFINED = "refined"
     """Replaced by a registration, from which the motion of the odometry does not differ enough for a repair."""
     REPAIRED = "repaired"
@@ -245,7 +245,7 @@ class MotionState(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Motion(Record):
-    """The check of a scan's motion since the last checked scan."""
+    """The check of a scan's motion."""
 
     state: MotionState
     moved_m: float | None = None

@@ -1,14 +1,10 @@
-"""An odometry whose motions are compared with the most likely ones, given the map of the last scans.
+"""An odometry whose motions are replaced by the most likely ones, given the map of the last scans.
 
-As long as the odometry is sound, a scan every `keyframes.distance_m` is compared with the previous one in a few
-milliseconds. If this contradicts the motion, the scan is registered with the last scans (`scan_to_map`), and the most
-likely pose is kept. At the start, after a repair, and while its poses differ from the last registrations by more than
-these are unsure, every scan is registered. After a repair the odometry continues from the local map; smaller
-corrections leave it undisturbed. They are added to its following poses while every scan is registered; else they are
-taken as errors that it corrects itself. A scan with too few points to show its motion moves on as the last ones did.
+Every scan is registered with the last ones (`scan_to_map`), from the pose of the odometry and others, and the most
+likely pose is kept; a given odometry keeps its poses where the scans do not contradict them. After a repair the
+odometry continues from the local map; smaller corrections leave it undisturbed, and are added to its following poses.
+A scan with too few points to show its motion moves on as the last ones did.
 """
-
-from collections import deque
 
 import numpy as np
 from scipy.special import chdtri
@@ -21,19 +17,14 @@ from segslam.graph.edges import BREAK_M
 from segslam.graph.noise import odometry_information
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import SeenScan
-from segslam.odometry.motion_model import WINDOW, Intervals
-from segslam.odometry.scan_to_map import ANYWHERE, Proposed, ScanToMap, fits_as_usual
+from segslam.odometry.motion_model import Intervals
+from segslam.odometry.scan_to_map import ANYWHERE, Proposed, ScanToMap
 from segslam.odometry.search import Recover
 from segslam.odometry.sweep import Foreseeing, Odometry, OdometryResult, at_stamp
 from segslam.registration.refinement import SHARED_NOISE
 
 MOST_OFF = float(chdtri(6, SIGNIFICANT))
 """Chi-square above which a pose of the odometry is significantly off the registered one."""
-MOST_OFF_TOGETHER = float(chdtri(6 * WINDOW, SIGNIFICANT))
-"""Sum of these chi-squares above which an odometry is less sure than the registrations of its last scans."""
-MOST_UNCHECKED = 2
-"""Chosen: number of scans after which a sensor that seems to stand still is checked: it may have begun to turn. Turns
-of 15 degrees a scan are then within the reach of the search."""
 
 
 class CheckedOdometry:
@@ -46,13 +37,8 @@ class CheckedOdometry:
         self._scans = ScanToMap(config, recover=recover)
         self._motion = self._scans.motion
         self._intervals = Intervals()
-        self._last_checks: deque[float] = deque(maxlen=WINDOW)
-        """How well the last scans were explained when they were checked."""
         self._T_odom_inner: Transform = np.eye(4)
         """Pose of the frame in which the inner odometry continues, undisturbed by small corrections."""
-        self._num_unchecked = 0
-        self._offs: deque[float] = deque(maxlen=WINDOW)
-        """Chi-squares of the odometry's poses, compared with registered ones, since the last repair."""
 
     def register(self, scan: Scan, *, gap: float = 1.0, ahead: Scan | None = None) -> OdometryResult:
         """The checked pose and the cropped points of the next scan. `gap` and BadScan as for the inner odometry.
@@ -67,73 +53,25 @@ class CheckedOdometry:
             self._inner.foresee(self._intervals.spanned(ahead), gap=self._intervals.gap(ahead.stamp_ns))
         if not self._config.health.check:
             return at_stamp(scan, result)
-        is_watched = self._is_watched
         T_odom_predicted = self._scans.T_odom_last @ self._motion.predicted(gap)
         seen = SeenScan(result.points, self._config.refine)
         proposed = Proposed(scan, result, seen, self._T_odom_inner @ result.T_odom_lidar, T_odom_predicted, gap)
         checked = self._checked(proposed)
         assert checked.motion
         self._scans.end_scan(scan, checked, gap)
-        if is_watched and checked.motion.state is MotionState.REFINED:
+        if checked.motion.state is MotionState.REFINED:
             T_inner_odom = geometry.inverse(result.T_odom_lidar)
             self._T_odom_inner = geometry.nearest_transform(checked.T_odom_lidar @ T_inner_odom)
         return at_stamp(scan, checked)
 
-    @property
-    def _is_watched(self) -> bool:
-        """True while every scan is registered: until the odometry agrees with a window of registrations."""
-        agrees = len(self._offs) == WINDOW and sum(self._offs) < MOST_OFF_TOGETHER
-        return self._inner.is_from_scans and not agrees
-
     def _checked(self, proposed: Proposed) -> OdometryResult:
-        """The scan with its pose and the result of its check, if one is due."""
-        if not self._is_due(proposed):
-            self._num_unchecked += 1
-            self._motion.follow(self._scans.since_last(proposed.T_odom_lidar), proposed.gap)
-            return proposed.at(proposed.T_odom_lidar, Motion(MotionState.UNCHECKED))
-        self._num_unchecked = 0
+        """The scan with the most likely pose."""
         if proposed.scan.is_small:
             return self._of_few_points(proposed)
         if len(self._scans.local) == 0:
             self._scans.local.add(proposed.T_odom_lidar, proposed.scan)
             return proposed.at(proposed.T_odom_lidar, Motion(MotionState.UNCHECKED))
-        confirmed = None if self._is_watched or proposed.gap > 1.0 else self._confirmed(proposed)
-        return confirmed or self._registered(proposed)
-
-    def _is_due(self, proposed: Proposed) -> bool:
-        """True if the motion is as long as a keyframe's since the last checked scan, or unlike the last motion.
-
-        And for a scan too small to show it, with which KISS-ICP moves at random.
-        """
-        if len(self._scans.local) == 0 or self._num_unchecked >= MOST_UNCHECKED:
-            return True
-        if self._is_watched or proposed.gap > 1.0 or proposed.scan.is_small:
-            return True
-        moved_m = geometry.displacement_m(proposed.scan.moments, proposed.T_odom_lidar, self._scans.local.T_odom_map)
-        sudden_m = geometry.displacement_m(proposed.scan.moments, proposed.T_odom_lidar, proposed.T_odom_predicted)
-        return moved_m >= self._config.keyframes.distance_m or sudden_m >= self._scans.local.voxel_m
-
-    def _confirmed(self, proposed: Proposed) -> OdometryResult | None:
-        """The proposed pose, if a few steps to the last checked scan leave it and fit as usual; else None."""
-        T_map_proposed = self._scans.local.pose_of(proposed.T_odom_lidar)
-        found = self._scans.local.check(proposed.scan, T_map_proposed)
-        if found is None or (off := _off(found.T_map_lidar, self._scans.covariance(found), T_map_proposed)) > MOST_OFF:
-            return None
-        is_usual = fits_as_usual(found, self._last_checks)
-        self._last_checks.append(found.mean_log)
-        if not is_usual:
-            return None
-        if not self._inner.is_from_scans:
-            return self._kept(proposed, found, is_unsure=False)
-        T_last_lidar, own = self._scans.since_last(proposed.T_odom_lidar), self._scans.covariance(found)
-        if _off(*self._motion.fused(T_last_lidar, own, proposed.gap), T_last_lidar) > MOST_OFF:
-            return None  # the last motions say more than the scan does
-        self._offs.append(off)
-        _, covariance = self._motion.update(T_last_lidar, own, proposed.gap)
-        self._scans.local.add(proposed.T_odom_lidar, proposed.scan)
-        return proposed.at(
-            proposed.T_odom_lidar, self._result(MotionState.CONFIRMED, T_map_proposed, found, covariance)
-        )
+        return self._registered(proposed)
 
     def _registered(self, proposed: Proposed) -> OdometryResult:
         """The most likely pose of the scan in the local map."""
@@ -151,11 +89,7 @@ class CheckedOdometry:
             T_last_lidar, covariance = motion.update(T_last_lidar, covariance, gap)
         covariance = covariance + found.unsure
         T_odom_lidar = geometry.nearest_transform(scans.T_odom_last @ T_last_lidar)
-        off = _off(T_odom_lidar, own + found.unsure, proposed.T_odom_lidar)
-        is_unlikely = off > MOST_OFF and found.contradicts(scans.local.fit(proposed.scan, T_map_proposed))
-        state = self._state(off, covariance, is_unlikely=is_unlikely)
-        if state is MotionState.CONFIRMED:
-            T_odom_lidar = proposed.T_odom_lidar
+        state = _state(_off(T_odom_lidar, own + found.unsure, proposed.T_odom_lidar), covariance)
         if found.is_lost:
             scans.leave_map(T_step_before, gap)
         scans.local.add(T_odom_lidar, proposed.scan)
@@ -172,12 +106,10 @@ class CheckedOdometry:
             return proposed.at(T_odom_lidar, Motion(MotionState.UNCHECKED))
         T_last_lidar, covariance = self._motion.update(self._motion.predicted(gap), np.diag(ANYWHERE**2), gap)
         T_odom_continued = geometry.nearest_transform(self._scans.T_odom_last @ T_last_lidar)
-        state = self._state(_off(T_odom_continued, covariance, T_odom_lidar), covariance, is_unlikely=True)
-        if state is not MotionState.CONFIRMED:
-            T_odom_lidar = T_odom_continued
-        self._follow(state, T_odom_lidar)
+        state = _state(_off(T_odom_continued, covariance, T_odom_lidar), covariance)
+        self._follow(state, T_odom_continued)
         return proposed.at(
-            T_odom_lidar, Motion(state, information=self._own_information(covariance), covariance=covariance)
+            T_odom_continued, Motion(state, information=self._own_information(covariance), covariance=covariance)
         )
 
     def _follow(self, state: MotionState, T_odom_lidar: Transform) -> None:
@@ -194,26 +126,10 @@ class CheckedOdometry:
         state = MotionState.UNCHECKED if is_unsure else MotionState.CONFIRMED
         return proposed.at(proposed.T_odom_lidar, self._result(state, T_map_proposed, best, None))
 
-    def _state(self, off: float, covariance: Information, *, is_unlikely: bool) -> MotionState:
-        """Name of the result. `off`, which is noted, and `is_unlikely` compare the odometry's pose with the one kept.
-
-        An odometry that agreed with the last registrations is repaired only where its pose explains the scan worse.
-        """
-        is_break = float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) > BREAK_M**2
-        is_watched, is_off = self._is_watched, off > MOST_OFF
-        is_repaired = is_off and (is_watched or is_unlikely)
-        if is_repaired or is_break:
-            self._offs.clear()
-            return MotionState.BROKEN if is_break else MotionState.REPAIRED
-        self._offs.append(off)
-        return MotionState.REFINED if is_watched or is_off else MotionState.CONFIRMED
-
     def _result(
         self, state: MotionState, T_map_proposed: Transform, fit: Fit, covariance: Information | None
     ) -> Motion:
         off = geometry.inverse(T_map_proposed) @ fit.T_map_lidar
-        if covariance is not None and state is MotionState.CONFIRMED:  # the pose is the proposed one, not the fit
-            covariance = covariance + np.outer(geometry.log(off), geometry.log(off))
         return Motion(
             state,
             geometry.distance(off),
@@ -239,6 +155,13 @@ class CheckedOdometry:
             return None
         half = np.linalg.inv(whiten) @ directions
         return np.linalg.inv(model + (half * np.maximum(excess, 0.0)) @ half.T)
+
+
+def _state(off: float, covariance: Information) -> MotionState:
+    """Name of a registered motion; `off`: chi-square of the odometry's pose, compared with the one kept."""
+    if float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) > BREAK_M**2:
+        return MotionState.BROKEN
+    return MotionState.REPAIRED if off > MOST_OFF else MotionState.REFINED
 
 
 def _off(T_known: Transform, covariance: Information, T_other: Transform) -> float:

@@ -13,7 +13,7 @@ from scipy.linalg import eigh
 
 from segslam.core import geometry
 from segslam.core.types import Information, Points, Transform, Vector
-from segslam.registration.refinement import LightSurface, Surface
+from segslam.registration.refinement import LightSurface
 
 OUTLIER_SHARE = 0.1
 """Chosen: share of points without a counterpart in the map."""
@@ -63,7 +63,7 @@ class Fit:
 
 
 def fit(
-    points: Points, target: Surface | LightSurface, T_target_source: Transform, *, voxel_m: float, sigma_m: float = 0.0
+    points: Points, target: LightSurface, T_target_source: Transform, *, voxel_m: float, sigma_m: float = 0.0
 ) -> Fit:
     """Fit of downsampled points (n, 3) to a surface with one point in each voxel, at a pose.
 

@@ -11,7 +11,7 @@ from segslam.core.config import RefineConfig
 from segslam.core.points import voxel_first, voxel_means
 from segslam.core.types import Points, Registration, Transform
 from segslam.odometry.likelihood import Fit, fit
-from segslam.odometry.nudge import CHECK_VOXELS, NUM_POINTS, NUM_SEARCH, POLISH_VOXELS, SEARCH_VOXELS, nudge
+from segslam.odometry.nudge import NUM_POINTS, NUM_SEARCH, POLISH_VOXELS, SEARCH_VOXELS, nudge
 from segslam.registration import refinement
 from segslam.registration.free_space import FreeSpace
 from segslam.registration.prepared import Observed
@@ -59,13 +59,8 @@ class SeenScan:
         return refinement.downsample(self.points, config=self._config)
 
     @cached_property
-    def light(self) -> refinement.LightSurface:
-        """The surface for the quick check."""
-        return refinement.LightSurface(self.thinned)
-
-    @cached_property
     def surface(self) -> refinement.Surface:
-        """The surface for a registration."""
+        """The surface, for GICP and the score."""
         return refinement.Surface(self.thinned, self._config)
 
     @cached_property
@@ -88,7 +83,9 @@ class LocalMap:
         self._config = config.model_copy(update={"correspondence_m": reaches_m})
         self._scans: deque[tuple[Transform, Points]] = deque(maxlen=MAP_SCANS)
         self._whole: deque[tuple[Transform, SeenScan]] = deque(maxlen=NUM_WHOLE)
+        self._light: refinement.LightSurface | None = None
         self._surface: refinement.Surface | None = None
+        self._roughness_m = 0.0
 
     @property
     def scans(self) -> list[tuple[Transform, Points]]:
@@ -120,7 +117,7 @@ class LocalMap:
                 return
         self._scans.append((T_odom_lidar, scan.thinned))
         self._whole.append((T_odom_lidar, scan))
-        self._surface = None
+        self._light = self._surface = None
 
     def cloud(self, enough: int) -> Points:
         """All points of the newest scans, in the frame of the newest one: as many scans as give `enough` voxels."""
@@ -142,24 +139,26 @@ class LocalMap:
             return points
         return geometry.apply(self.pose_of(T_odom_lidar), points.astype(np.float64))
 
-    def surface(self) -> refinement.Surface:
+    def light(self) -> refinement.LightSurface:
         """The surface of all scans as far from the newest one as a scan reaches, in its frame; cached."""
-        if self._surface is None:
+        if self._light is None:
             clouds = [self._in_map(thinned, T_odom_lidar) for T_odom_lidar, thinned in self._scans]
             if len(clouds) > 1:
                 clouds = [voxel_means(np.vstack(clouds), self.voxel_m, within_m=refinement.MAX_RANGE_M)]
-            self._surface = refinement.Surface(clouds[0].astype(np.float32), self._config)
+            self._light = refinement.LightSurface(clouds[0].astype(np.float32))
+            self._roughness_m = self._light.roughness_m(self.voxel_m, NUM_POINTS)
+        return self._light
+
+    def surface(self) -> refinement.Surface:
+        """The same, for GICP and the score; cached."""
+        if self._surface is None:
+            self._surface = refinement.Surface(self.light().points.astype(np.float32), self._config)
         return self._surface
 
     @property
     def observed(self) -> Observed:
         """The surface, with what the newest scan saw through."""
         return Observed(self.surface(), self.newest.free_space)
-
-    def check(self, scan: SeenScan, T_map_lidar: Transform) -> Fit | None:
-        """The pose after a few steps from this one to the newest scan alone; None if the two scans do not overlap."""
-        found = nudge(scan.thinned, self.newest.light, T_map_lidar, voxel_m=self.voxel_m, reaches=CHECK_VOXELS)
-        return None if found is None else fit(scan.thinned, self.newest.light, found, voxel_m=self.voxel_m)
 
     def register(self, scan: SeenScan, T_map_guess: Transform) -> list[Fit]:
         """The pose of a scan in the map near an initial guess, by GICP and then robust steps; none without overlap."""
@@ -169,18 +168,22 @@ class LocalMap:
         polished = self._nudged(scan, found.T_target_source, POLISH_VOXELS, NUM_POINTS)
         return [] if polished is None else [polished]
 
+    def polish(self, scan: SeenScan, T_map_guess: Transform) -> Fit | None:
+        """The pose of a scan in the map near a good guess, by robust steps alone; None as `approach`."""
+        return self._nudged(scan, T_map_guess, SEARCH_VOXELS, NUM_POINTS)
+
     def approach(self, scan: SeenScan, T_map_guess: Transform) -> Fit | None:
         """The pose to which robust steps with few points lead from a guess; None if too few points are near the map."""
         return self._nudged(scan, T_map_guess, SEARCH_VOXELS, NUM_SEARCH)
 
     def fit(self, scan: SeenScan, T_map_lidar: Transform) -> Fit:
         """The likelihood of the scan at this pose."""
-        surface = self.surface()
-        return fit(scan.surface.points, surface, T_map_lidar, voxel_m=self.voxel_m, sigma_m=surface.roughness_m)
+        surface = self.light()
+        return fit(scan.thinned, surface, T_map_lidar, voxel_m=self.voxel_m, sigma_m=self._roughness_m)
 
     def _nudged(self, scan: SeenScan, T_map_guess: Transform, reaches: Sequence[float], num_points: int) -> Fit | None:
         """None also if a step leads away from the map: along a single plane, which does not constrain it."""
-        source, target = scan.surface.points, self.surface()
+        source, target = scan.thinned, self.light()
         found = nudge(source, target, T_map_guess, voxel_m=self.voxel_m, reaches=reaches, num_points=num_points)
         fit = None if found is None else self.fit(scan, found)
         return None if fit is None or fit.overlap == 0.0 else fit

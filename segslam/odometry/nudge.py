@@ -10,13 +10,11 @@ import numpy as np
 from segslam.core import geometry
 from segslam.core.kernels import kernel
 from segslam.core.types import Points, Transform
-from segslam.registration.refinement import LightSurface, Surface
+from segslam.registration.refinement import PRECISION_M, LightSurface
 
 NUM_POINTS, NUM_SEARCH = 1500, 400
 """Chosen: number of points. With all points the correction of KITTI's scans at 2 m changes by less than 5 mm; fewer are
 enough to find where a search from afar ends."""
-CHECK_VOXELS = (2.0, 2.0, 1.0)
-"""Search distance of each step of a check, in voxels of the points."""
 POLISH_VOXELS = (1.4, 1.4, 1.0, 1.0, 1.0)
 """Chosen: the same after GICP, to which every point has the same weight."""
 SEARCH_VOXELS = (4.0, 3.0, 2.0, 2.0, 1.4, 1.4, 1.0, 1.0, 1.0, 1.0)
@@ -28,7 +26,7 @@ LEAST_POINTS, LEAST_NEAR = 50, 30
 
 def nudge(
     points: Points,
-    target: Surface | LightSurface,
+    target: LightSurface,
     T_target_source: Transform,
     *,
     voxel_m: float,
@@ -37,16 +35,20 @@ def nudge(
 ) -> Transform | None:
     """Point-to-plane correction of a pose, a step for each search distance; None if too few points are near the target.
 
-    `points` (n, 3) of the source, downsampled with `voxel_m`; `reaches`: search distances in voxels. Chen and Medioni
-    1992, with Cauchy weights: points on a vehicle that drives ahead have little weight.
+    A step is left out if the last one, with the same distance, moved the points by less than `PRECISION_M`. `points`
+    (n, 3) of the source, downsampled with `voxel_m`; `reaches`: search distances in voxels. Chen and Medioni 1992, with
+    Cauchy weights: points on a vehicle that drives ahead have little weight.
     """
     if min(len(points), len(target.points)) < LEAST_POINTS:
         return None
     chosen = points[:: max(1, len(points) // num_points)].astype(np.float64)
     target_points, scale_m = target.points, SCALE_VOXELS * voxel_m
-    T_now = T_target_source
+    T_now, before, reach_before = T_target_source, np.full_like(chosen, np.inf), 0.0
     for reach in reaches:
         moved = geometry.apply(T_now, chosen)
+        if reach == reach_before and np.square(moved - before).sum(axis=1).mean() < PRECISION_M**2:
+            continue
+        before, reach_before = moved, reach
         rows, apart_m = target.nearest(moved)
         near = apart_m < reach * voxel_m
         if near.sum() < LEAST_NEAR:

@@ -8,7 +8,7 @@ moved to the end of their sweep by the motion that the pose shows, and the scan 
 
 import math
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from statistics import median
 from typing import NamedTuple
@@ -159,7 +159,9 @@ class ScanToMap:
         """Poses in the local map, which may be that before a break again, the most likely first; and their search."""
         search = self._search(proposed)
         starts = [self.local.pose_of(T) for T in (proposed.T_odom_lidar, proposed.T_odom_predicted)]
-        fits = search.near(starts)
+        fits = search.polished(starts[0]) if len(self._last_fits) == WINDOW and proposed.gap == 1.0 else []
+        if not self._is_usual(fits):
+            fits = search.near(starts)
         rejoined = self._rejoined(proposed, fits)
         if rejoined is not None:
             return rejoined
@@ -255,18 +257,14 @@ class ScanToMap:
         return self._is_usual(fits) or search.log_odds(fits[0]) > -math.log(SIGNIFICANT)
 
     def _is_usual(self, fits: Sequence[Fit]) -> bool:
-        """True if the most likely pose explains the scan as usual; False if there is none."""
-        return bool(fits) and fits_as_usual(fits[0], self._last_fits)
+        """True if the most likely pose explains its scan at most three standard deviations worse than the last ones.
 
-
-def fits_as_usual(fit: Fit, last: Collection[float]) -> bool:
-    """True if a pose explains its scan at most three standard deviations worse than the median of the last ones.
-
-    The standard deviation is that of a normal distribution with the same median absolute deviation, and at least that
-    of the mean of the patches. False if nothing is known of the last ones.
-    """
-    if not last:
-        return False
-    middle = median(last)
-    spread = 1.4826 * median(abs(other - middle) for other in last)
-    return fit.mean_log >= middle - 3.0 * max(spread, fit.num_patches**-0.5)
+        The standard deviation, about the median, is that of a normal distribution with the same median absolute
+        deviation, and at least that of the mean of the patches. False without a pose, or if nothing is known of the
+        last ones.
+        """
+        if not fits or not self._last_fits:
+            return False
+        middle = median(self._last_fits)
+        spread = 1.4826 * median(abs(other - middle) for other in self._last_fits)
+        return fits[0].mean_log >= middle - 3.0 * max(spread, fits[0].num_patches ** -0.5)

@@ -54,6 +54,12 @@ class PoseSearch:
                 starts.append(T_map_start)
         return self._compared([*known, *self._registered(starts)])
 
+    def polished(self, T_map_proposed: Transform) -> list[Fit]:
+        """The pose at which a few steps from the proposed one end; none if that is another pose."""
+        found = self.local.polish(self._scan, T_map_proposed)
+        is_near = found is not None and self.is_same(found.T_map_lidar, T_map_proposed)
+        return [self._with_prior(found)] if found is not None and is_near else []
+
     def around(self, T_map_last: Transform, T_step: Transform, known: Sequence[Fit]) -> list[Fit]:
         """`known` poses and those reached from poses around the last one: turned, and moved by shares of `T_step`."""
         starts = [

@@ -77,7 +77,7 @@ class Surface:
         to noise and shape within one scan at this voxel size."""
         if len(downsampled) >= MIN_POINTS:
             small_gicp.estimate_normals_covariances(self.cloud, self.tree, NUM_NEIGHBOURS, 1)
-            self.roughness_m = max(self._roughness_m(), self.roughness_m)
+            self.roughness_m = max(_roughness_m(self, np.arange(len(self)), config.voxel_m), self.roughness_m)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Surface, (self.points.astype(np.float32), self._config)
@@ -124,26 +124,16 @@ class Surface:
         sampled = small_gicp.voxelgrid_sampling(self.points, SPARSE_VOXELS * self._config.voxel_m, 1)
         return Surface(sampled.points()[:, :3], self._config) if sampled.size() >= LEAST_SPARSE else self
 
-    def _roughness_m(self) -> float:
-        standing, _ = self.standing()
-        if not len(standing):
-            return 0.0
-        nearest, squared = (np.asarray(found) for found in self.tree.batch_knn_search(standing, 2, num_threads=1))
-        near = squared[:, 1] < (ROUGHNESS_REACH * self._config.voxel_m) ** 2
-        others = nearest[near, 1]
-        to_plane = np.einsum("ij,ij->i", standing[near] - self.points[others], self.normals[others])
-        return float(np.sqrt(np.mean(to_plane**2))) if len(others) else 0.0
-
 
 class LightSurface:
     """Downsampled points (n, 3) with their search tree; normals are computed for the requested points only.
 
-    Enough for quick checks of a pose; it takes a third of the time of a `Surface`.
+    Enough for steps from points to planes (`nudge`); it takes a third of the time of a `Surface`.
     """
 
     def __init__(self, thinned: Points) -> None:
         self.points = np.ascontiguousarray(thinned, dtype=np.float64)
-        self._tree = _tree_of(self.points)
+        self.tree = _tree_of(self.points)
         self._normals = np.zeros_like(self.points)
         self._has_normal = np.zeros(len(thinned), dtype=bool)
 
@@ -152,7 +142,7 @@ class LightSurface:
 
     def nearest(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
         """As `Surface.nearest`."""
-        rows, squared = self._tree.batch_nearest_neighbor_search(points, num_threads=1)
+        rows, squared = self.tree.batch_nearest_neighbor_search(points, num_threads=1)
         return np.asarray(rows, dtype=np.int64), np.sqrt(squared)
 
     def normals_at(self, rows: Indices) -> Points:
@@ -161,10 +151,31 @@ class LightSurface:
         is_new[rows] = True
         new = np.flatnonzero(is_new & ~self._has_normal)
         if len(new):
-            patches, _ = self._tree.batch_knn_search(self.points[new], NUM_NEIGHBOURS, num_threads=1)
+            patches, _ = self.tree.batch_knn_search(self.points[new], NUM_NEIGHBOURS, num_threads=1)
             self._normals[new] = patch_normals(self.points, np.ascontiguousarray(patches, dtype=np.int64))
             self._has_normal[new] = True
         return self._normals[rows]
+
+    def roughness_m(self, voxel_m: float, num_points: int) -> float:
+        """As that of a `Surface`, of about `num_points` of the points, which are downsampled with `voxel_m`."""
+        rows = np.arange(0, len(self), max(1, len(self) // num_points))
+        return max(_roughness_m(self, rows, voxel_m), LEAST_ROUGHNESS * voxel_m)
+
+
+def _roughness_m(surface: Surface | LightSurface, rows: Indices, voxel_m: float) -> float:
+    """Of the standing points among these, which are downsampled with `voxel_m`; 0 without any."""
+    standing = rows[np.abs(surface.normals_at(rows)[:, 2]) < STANDING_NORMAL_Z]
+    if not len(standing):
+        return 0.0
+    nearest, squared = (
+        np.asarray(found) for found in surface.tree.batch_knn_search(surface.points[standing], 2, num_threads=1)
+    )
+    near = squared[:, 1] < (ROUGHNESS_REACH * voxel_m) ** 2
+    others = nearest[near, 1].astype(np.int64)
+    to_plane = np.einsum(
+        "ij,ij->i", surface.points[standing[near]] - surface.points[others], surface.normals_at(others)
+    )
+    return float(np.sqrt(np.mean(to_plane**2))) if len(others) else 0.0
 
 
 def downsample(points: Points, *, config: RefineConfig) -> Points:

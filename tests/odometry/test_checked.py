@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -24,12 +24,12 @@ from segslam.odometry.kiss import KissOdometry
 from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, information_of
-from segslam.odometry.nudge import CHECK_VOXELS, nudge
+from segslam.odometry.nudge import POLISH_VOXELS, nudge
 from segslam.odometry.scan_to_map import Proposed
 from segslam.odometry.search import PoseSearch, as_likely
 from segslam.odometry.sweep import GivenOdometry, OdometryResult
 from segslam.odometry.tracker import Tracker
-from segslam.registration.refinement import SHARED_NOISE_DEG, SHARED_NOISE_M
+from segslam.registration.refinement import SHARED_NOISE_DEG, SHARED_NOISE_M, LightSurface
 from segslam.registration.refinement import refine as refined
 from segslam.scans import open_dataset
 from segslam.slam.slam import Slam
@@ -37,7 +37,6 @@ from segslam.verification import register
 
 CONFIG = load_config(None, ["proximity.min_travel_m=60"])
 SLIP_AT = 20
-JUMPS_AT = WINDOW + 5
 
 
 def _given(poses: np.ndarray, config: Config = CONFIG) -> GivenOdometry:
@@ -130,6 +129,24 @@ def test_a_wrong_first_motion_is_repaired_and_a_right_one_is_kept(metres: float)
     assert _worst_step_m(results[:2]) < 0.06
 
 
+@pytest.mark.long
+def test_a_slow_sensor_does_not_lag_behind_as_its_odometry_does() -> None:
+    """KISS-ICP lags in corridors at the pace of a robot, by less a scan than any single scan can show."""
+    num, step_m = WINDOW + 40, 0.03
+    scan = round_drive()[0][0]
+    poses = np.array([geometry.transform(np.eye(3), [step_m * row, 0.0, 0.0]) for row in range(num)])
+    scans = [
+        replace(scan, points=geometry.apply(geometry.inverse(pose), scan.points).astype(np.float32), index=row)
+        for row, pose in enumerate(poses)
+    ]
+    lagging = poses.copy()
+    lagging[:, 0, 3] *= 0.7
+    trajectory = Trajectory(np.arange(num), np.arange(num) * 100_000_000, lagging)
+    odometry = CheckedOdometry(_LikeKiss(trajectory, CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
+    off_m = poses[-1, 0, 3] - _registered(odometry, scans)[-1].T_odom_lidar[0, 3]
+    assert off_m == pytest.approx(0.0, abs=0.05)
+
+
 def test_small_corrections_do_not_disturb_an_odometry_and_add_up() -> None:
     """An odometry that drifts sideways by 5 cm a scan continues in its own frame, each motion corrected."""
 
@@ -149,50 +166,6 @@ def test_small_corrections_do_not_disturb_an_odometry_and_add_up() -> None:
     assert _worst_step_m(results) < 0.05
     T_true = geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[24]
     assert geometry.distance(geometry.inverse(T_true) @ results[24].T_odom_lidar) < 0.2
-
-
-@cache
-def _jittering(sigma_m: float, aside_m: float = 0.0) -> list[OdometryResult]:
-    """Results for an odometry that errs at random by so much along each axis, and aside by more at scan JUMPS_AT."""
-    scans, truth = round_drive()
-    poses = truth.T_world_lidar.copy()
-    poses[:, :3, 3] += np.random.default_rng(1).normal(0.0, sigma_m, (len(poses), 3))
-    poses[JUMPS_AT] = poses[JUMPS_AT] @ geometry.transform(np.eye(3), [0.0, aside_m, 0.0])
-    inner = _LikeKiss(replace(truth, T_world_lidar=poses), CONFIG.odometry)
-    odometry = CheckedOdometry(inner, CONFIG, recover=partial(register, config=CONFIG))
-    return _registered(odometry, scans[: JUMPS_AT + 5])
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("sigma_m", "agrees"), [(0.005, True), (0.06, False)])
-def test_every_scan_is_registered_until_the_odometry_agrees_with_a_window_of_registrations(
-    sigma_m: float, agrees: bool
-) -> None:
-    states = [result.motion.state for result in _jittering(sigma_m) if result.motion]
-    registered = {MotionState.REFINED, MotionState.REPAIRED}
-    assert set(states[2:WINDOW]) <= registered
-    if agrees:
-        assert MotionState.REPAIRED not in states
-        assert registered.isdisjoint(states[WINDOW + 1 :])
-    else:
-        assert set(states[WINDOW + 1 :]) <= registered
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("metres", "state"), [(0.07, MotionState.CONFIRMED), (0.2, MotionState.REFINED)])
-def test_an_odometry_that_agrees_corrects_its_errors_itself(metres: float, state: MotionState) -> None:
-    results, plain = _jittering(0.005, metres), _jittering(0.005)
-    motion = results[JUMPS_AT].motion
-    assert motion is not None
-    assert motion.state is state
-    off_m = geometry.distance(geometry.inverse(plain[JUMPS_AT].T_odom_lidar) @ results[JUMPS_AT].T_odom_lidar)
-    if state is MotionState.CONFIRMED:
-        assert off_m == pytest.approx(metres, abs=0.001)
-    else:
-        assert off_m < 0.06
-    for after, undisturbed in zip(results[JUMPS_AT + 1 :], plain[JUMPS_AT + 1 :], strict=True):
-        np.testing.assert_allclose(after.T_odom_lidar, undisturbed.T_odom_lidar, atol=0.06)
-        assert (after.motion and after.motion.state) is (undisturbed.motion and undisturbed.motion.state)
 
 
 def test_a_tracked_scan_has_the_result_of_its_check() -> None:
@@ -440,21 +413,6 @@ def _carried(row: int) -> Scan:
     return Scan(points, 10**8 * row, row, times=times, stamp_time=0.25)
 
 
-@pytest.mark.parametrize("is_small", [True, False])
-def test_a_scan_of_a_few_points_is_checked_however_little_it_moves(
-    is_small: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """KISS-ICP moves as it did before with any scan, and at random with a wall just ahead of the sensor."""
-    scans, truth = round_drive()
-    odometry = CheckedOdometry(_LikeKiss(truth, CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
-    results = _registered(odometry, scans[:5])
-    monkeypatch.setattr(CheckedOdometry, "_is_watched", False)
-    T_odom_lidar = results[-1].T_odom_lidar
-    every = 700 if is_small else 1
-    seen = SeenScan(scans[5].points[::every], CONFIG.refine)
-    assert odometry._is_due(_proposed(seen, T_odom_lidar)) is is_small
-
-
 def test_of_two_poses_that_explain_a_scan_nearly_as_well_the_usual_motion_is_more_likely() -> None:
     model = MotionModel()
     step = geometry.transform(np.eye(3), [1.0, 0.0, 0.0])
@@ -567,6 +525,7 @@ def test_a_pose_at_which_no_point_is_near_the_map_is_none(monkeypatch: pytest.Mo
     monkeypatch.setattr(local_map, "nudge", lambda *_, **__: far)
     assert local.register(scan, np.eye(4)) == []
     assert local.approach(scan, np.eye(4)) is None
+    assert local.polish(scan, np.eye(4)) is None
 
 
 def test_points_on_the_borders_of_voxels_are_in_the_same_ones_for_poses_that_differ_by_rounding() -> None:
@@ -627,11 +586,7 @@ def test_a_scan_of_an_unusual_fit_is_searched_around_unless_its_score_is_good(
     assert bool(searched) is is_searched
 
 
-@pytest.mark.parametrize("spread", [0.0, 1.0])
-def test_a_fit_below_the_last_ones_is_searched_around_however_much_the_checks_vary(
-    spread: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """On NCLT the checks are few and of the start of the drive, and say nothing of the scans there are now."""
+def test_a_fit_below_the_last_ones_is_searched_around(monkeypatch: pytest.MonkeyPatch) -> None:
     scans, truth = round_drive()
     odometry = _checked(truth.T_world_lidar)
     _registered(odometry, scans[:SLIP_AT])
@@ -639,10 +594,7 @@ def test_a_fit_below_the_last_ones_is_searched_around_however_much_the_checks_va
     seen = SeenScan(scans[SLIP_AT].points, CONFIG.refine)
     found = odometry._scans.local.fit(seen, geometry.inverse(odometry._scans.local.T_odom_map) @ T_odom_lidar)
     odometry._scans._last_fits.clear()
-    odometry._last_checks.clear()
-    for sign in (-1.0, 1.0):
-        odometry._scans._last_fits.append(found.mean_log + 1.0)
-        odometry._last_checks.append(sign * spread)
+    odometry._scans._last_fits.append(found.mean_log + 1.0)
     searched: list[object] = []
     monkeypatch.setattr(PoseSearch, "log_odds", lambda *_: 1.0)
     monkeypatch.setattr(PoseSearch, "around", lambda search, *_: searched.append(search) or [])
@@ -770,17 +722,6 @@ def test_a_scan_that_shows_nothing_in_a_direction_is_as_unsure_there_as_one_that
     assert (sigma[[1, 2, 4, 5]] < 0.04).all()
 
 
-@pytest.mark.parametrize("state", [MotionState.CONFIRMED, MotionState.REFINED])
-def test_a_pose_that_is_kept_is_unsure_by_its_distance_from_the_registered_one(state: MotionState) -> None:
-    odometry = _checked(round_drive()[1].T_world_lidar)
-    at_m = geometry.transform(np.eye(3), [0.0, 0.05, 0.0])
-    known = 1e-4 * np.eye(6)
-    motion = odometry._result(state, np.eye(4), Fit(at_m, 0.0, 100, 1.0, 0.05, 1e4 * np.eye(6)), known)
-    assert motion.covariance is not None
-    expected = known + np.diag([0.0, 0.0, 0.0, 0.0, 0.05**2 * (state is MotionState.CONFIRMED), 0.0])
-    np.testing.assert_allclose(motion.covariance, expected, atol=1e-9)
-
-
 @pytest.mark.parametrize("num_points", [300, 20_000])
 def test_how_far_two_poses_move_a_scan_is_seen_by_some_of_its_points(num_points: int) -> None:
     points = np.random.default_rng(0).normal(size=(num_points, 3)).astype(np.float32)
@@ -840,13 +781,14 @@ def test_recovery_without_initial_guess_runs_only_where_guesses_fail() -> None:
 
 
 @pytest.mark.parametrize("moved_m", [0.1, 0.2])
-def test_the_quick_check_measures_a_small_slip(moved_m: float) -> None:
+def test_a_few_steps_correct_a_small_slip(moved_m: float) -> None:
     scans, truth = round_drive()
     seen = [SeenScan(scan.points, CONFIG.refine) for scan in scans[:2]]
     T_target_source = geometry.inverse(truth.T_world_lidar[0]) @ truth.T_world_lidar[1]
     slip = geometry.transform(np.eye(3), [moved_m, 0.0, 0.0])
     T_slipped = T_target_source @ slip
-    found = nudge(seen[1].thinned, seen[0].light, T_slipped, voxel_m=CONFIG.refine.voxel_m, reaches=CHECK_VOXELS)
+    target = LightSurface(seen[0].thinned)
+    found = nudge(seen[1].thinned, target, T_slipped, voxel_m=CONFIG.refine.voxel_m, reaches=POLISH_VOXELS)
     assert found is not None
     assert geometry.distance(geometry.inverse(T_slipped) @ found) == pytest.approx(moved_m, abs=0.06)
 
@@ -935,8 +877,8 @@ def _into_a_tunnel(num_scans: int = 40) -> list[Scan]:
 def test_points_on_a_plane_are_as_likely_as_nine_tenths_of_inliers_make_them() -> None:
     at_m = np.arange(0.25, 15.0, 0.5)
     wall = np.stack([*np.meshgrid(at_m, at_m), np.full((30, 30), 2.0)], axis=-1).reshape(-1, 3).astype(np.float32)
-    found = fit(wall, SeenScan(wall, CONFIG.refine).light, np.eye(4), voxel_m=0.5, sigma_m=0.1)
-    away = fit(wall + np.float32(30.0), SeenScan(wall, CONFIG.refine).light, np.eye(4), voxel_m=0.5, sigma_m=0.1)
+    found = fit(wall, LightSurface(wall), np.eye(4), voxel_m=0.5, sigma_m=0.1)
+    away = fit(wall + np.float32(30.0), LightSurface(wall), np.eye(4), voxel_m=0.5, sigma_m=0.1)
     outlier = 0.1 / 2.0
     assert found.mean_log == pytest.approx(np.log(0.9 / (np.sqrt(2.0 * np.pi) * 0.1) + outlier), abs=1e-6)
     assert away.mean_log == pytest.approx(np.log(outlier), abs=1e-6)
@@ -948,7 +890,7 @@ def test_a_scan_of_a_smooth_tunnel_does_not_constrain_the_position_along_it() ->
     sigmas_m = []
     for points in ((_tunnel_scan(0).points @ R.T).astype(np.float32), round_drive()[0][0].points):
         scan = SeenScan(points, CONFIG.refine)
-        found = fit(scan.thinned, scan.light, np.eye(4), voxel_m=CONFIG.refine.voxel_m)
+        found = fit(scan.thinned, LightSurface(scan.thinned), np.eye(4), voxel_m=CONFIG.refine.voxel_m)
         covariance = np.linalg.inv(found.information)[3:, 3:]
         sigmas_m.append(np.sqrt(np.linalg.eigvalsh(covariance)))
         if len(sigmas_m) == 1:
@@ -1110,6 +1052,8 @@ def test_a_map_before_a_break_is_found_again_where_the_motion_before_it_leads(nu
         for num in (num_steps, 8)
     )
     odometry._scans._lost = before, T_step, 1.0
+    while len(odometry._scans._last_fits) > 1:  # that of the second scan, in a map as sparse as here
+        odometry._scans._last_fits.pop()
     far_off = last @ geometry.transform(geometry.yaw(2.0), [0.0, -40.0, 0.0])
     scan = SeenScan(scans[SLIP_AT + 7].points, CONFIG.refine)
     found = odometry._scans._rejoined(_proposed(scan, far_off, gap), [])
@@ -1124,14 +1068,11 @@ def test_an_odometry_that_reports_no_motion_is_checked_too() -> None:
     poses = np.repeat(truth.T_world_lidar[:1], 21, axis=0)
     given = GivenOdometry(Trajectory(np.arange(21), np.arange(21) * 100_000_000, poses), CONFIG.odometry)
     results = _registered(CheckedOdometry(given, CONFIG, recover=partial(register, config=CONFIG)), standing)
-    checked = [row for row, result in enumerate(results) if result.motion and result.motion.overlap is not None]
-    assert checked == list(range(3, 21, 3))
+    assert all(result.motion and result.motion.overlap is not None for result in results[1:])
 
 
-def test_a_turn_that_the_odometry_does_not_follow_is_found_while_the_search_reaches_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The odometry agreed with the scans before, and its poses stay where they were."""
+def test_a_turn_that_the_odometry_does_not_follow_is_found_while_the_search_reaches_it() -> None:
+    """The poses of the odometry stay where they were."""
     scans, truth = round_drive()
     last = scans[SLIP_AT - 1]
     turns = [geometry.transform(geometry.yaw(np.radians(15.0 * count)), np.zeros(3)) for count in range(1, 7)]
@@ -1145,7 +1086,6 @@ def test_a_turn_that_the_odometry_does_not_follow_is_found_while_the_search_reac
     trajectory = replace(truth, T_world_lidar=poses)
     odometry = CheckedOdometry(_LikeKiss(trajectory, CONFIG.odometry), CONFIG, recover=lambda source, target: none)
     before = _registered(odometry, scans[:SLIP_AT])[-1].T_odom_lidar
-    monkeypatch.setattr(CheckedOdometry, "_is_watched", False)
     results = zip(turns, _registered(odometry, turned), strict=True)
     offs = [geometry.inverse(before @ turn) @ result.T_odom_lidar for turn, result in results]
     best = min(offs[-3:], key=geometry.angle)

@@ -56,6 +56,23 @@ def _noise(points: Points, row: int) -> Points:
     return near + np.random.default_rng(row).normal(scale=0.03, size=near.shape)
 
 
+def _rain(points: Points, row: int) -> Points:
+    """A tenth of the rays end at drops, most of them near the sensor."""
+    random = np.random.default_rng(row)
+    ranges = np.linalg.norm(points, axis=1)
+    drops = np.minimum(random.exponential(4.0, len(points)), ranges)
+    shares = np.where(random.random(len(points)) < 0.1, drops / np.maximum(ranges, 1e-9), 1.0)
+    return points * shares[:, None]
+
+
+def _vehicle(points: Points, row: int) -> Points:
+    """The sensor sees its own vehicle: a wall as wide as a cabin, 3 m behind it, with 2 cm of noise."""
+    shares = 3.0 / np.where(points[:, 0] < 0.0, -points[:, 0], np.nan)
+    hits = (shares < 1.0) & (np.abs(points[:, 1] * shares) < 1.25) & (points[:, 2] * shares < 1.0)
+    noisy = shares + np.random.default_rng(row).normal(scale=0.02 / 3.0, size=len(points))
+    return np.where(hits[:, None], points * noisy[:, None], points)
+
+
 class Alteration(NamedTuple):
     """Which rows, in order; what becomes of their points; and the axes of the altered sensor."""
 
@@ -80,6 +97,8 @@ ALTERATIONS = {
     "there-and-back": Alteration(lambda rows: rows[::2] + rows[1::2][::-1]),
     "gap-30": Alteration(lambda rows: rows[: int(0.45 * len(rows))] + rows[int(0.45 * len(rows)) + 30 :]),
     "noise-3-cm-30-m": Alteration(points=_noise),
+    "rain": Alteration(points=_rain),
+    "own-vehicle": Alteration(points=_vehicle),
     "tilted": Alteration(axes=ScipyRotation.from_euler("XY", [10.0, 30.0], degrees=True).as_matrix()),
     "upside-down": Alteration(axes=np.diag([1.0, -1.0, -1.0])),
     "mirrored": Alteration(axes=np.diag([1.0, -1.0, 1.0])),

@@ -3,7 +3,7 @@
     python -m tools.benchmarks.scene_drives [SCENE ...] [--sensors "16" "70 wide"] [--seed 0] [--out scene_drives.json]
 
 A sensor moves 0.4 m a scan, or turns by 12 degrees, and sways by centimetres and degrees. Each row is a run of
-`segslam map`. `--stride 6` leaves out scans.
+`segslam map`. `--stride 6` leaves out scans; `--stride 0.1 --metres 12` is a slow robot on the first part of the path.
 """
 
 import json
@@ -26,14 +26,15 @@ SWAY_SCANS = 6.0
 NOISE_M = 0.02
 
 
-def driven(name: str, sensor: str, seed: int, stride: int) -> Altered:
-    """A drive along the path of a scene, as far as it leads without a jump, and back."""
+def driven(name: str, sensor: str, seed: int, stride: float, most_m: float = math.inf) -> Altered:
+    """A drive along the path of a scene, `most_m` or as far as it leads without a jump, and back."""
     scene = SCENES[name](seed)
     path, along_m = continuous_path(scene)
-    there = np.column_stack([np.interp(np.arange(0.0, along_m[-1], STEP_M), along_m, column) for column in path.T])
-    turn = np.tile(there[-1], (round(180.0 / TURN_DEG) - 1, 1))
-    turn[:, 3] += np.radians(TURN_DEG) * np.arange(1, len(turn) + 1)
-    places = np.concatenate([there, turn, there[::-1] + np.array([0.0, 0.0, 0.0, math.pi])])[::stride]
+    at_m = np.arange(0.0, min(along_m[-1], most_m), STEP_M * stride)
+    there = np.column_stack([np.interp(at_m, along_m, column) for column in path.T])
+    turn = np.tile(there[-1], (round(180.0 / (TURN_DEG * stride)) - 1, 1))
+    turn[:, 3] += np.radians(TURN_DEG * stride) * np.arange(1, len(turn) + 1)
+    places = np.concatenate([there, turn, there[::-1] + np.array([0.0, 0.0, 0.0, math.pi])])
     sway = gaussian_filter1d(np.random.default_rng(seed).normal(size=(len(places), 6)), SWAY_SCANS / stride, axis=0)
     sway *= SWAY / sway.std(axis=0)
     poses = np.array(
@@ -56,13 +57,14 @@ def run_benchmark() -> None:
     options.add_argument("scenes", nargs="*", metavar="SCENE", help=", ".join(SCENES))
     options.add_argument("--sensors", nargs="+", default=["16", "70 wide"], help=", ".join(SENSORS))
     options.add_argument("--seed", type=int, default=0)
-    options.add_argument("--stride", type=int, default=1)
+    options.add_argument("--stride", type=float, default=1.0)
+    options.add_argument("--metres", type=float, default=math.inf)
     options.add_argument("--out", type=Path, default=Path("scene_drives.json"))
     given = options.parse_args()
     rows = []
     for sensor in given.sensors:
         for name in given.scenes or SCENES:
-            drive = driven(name, sensor, given.seed, given.stride)
+            drive = driven(name, sensor, given.seed, given.stride, given.metres)
             rows.append({"scene": name, "sensor": sensor, "scans": len(drive.stamps_s), **mapped(drive)})
             print(json.dumps(rows[-1]), flush=True)
     common.write_report(given.out, {"rows": rows})

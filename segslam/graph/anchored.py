@@ -8,7 +8,7 @@ optimisation of loops and breaks therefore applies to placements without change.
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import NoReturn
 
 import numpy as np
 
@@ -85,13 +85,13 @@ class AnchoredGraph:
             information = np.zeros((6, 6))
         self._graph.add_keyframe(keyframe_id + 1, T_odom_keyframe, travel_m, information=information, stamp_ns=stamp_ns)
 
-    def add_closure(self, closure: LoopClosure) -> Any:
+    def add_closure(self, closure: LoopClosure) -> NoReturn:
         """Raises SegslamError: a localised drive has no loops of its own."""
         raise SegslamError(f"keyframe {closure.source_id}: a drive localised in a map cannot have loops of its own")
 
     weigh_odometry_by = add_closure
 
-    def consistent_pairs(self, closures: Sequence[LoopClosure]) -> Any:
+    def consistent_pairs(self, closures: Sequence[LoopClosure]) -> NoReturn:
         """As `add_closure`."""
         self.add_closure(closures[0])
 

@@ -75,7 +75,7 @@ def optimize_graph(graph: G2oGraph, *, robust: Robust = "consistent") -> Optimiz
     start = values_of(graph.T_world_vertex.values(), graph.T_world_vertex)
     backbone = gtsam.NonlinearFactorGraph()
     for vertex in graph.fixed or (next(iter(graph.T_world_vertex)),):  # these fix the world frame
-        backbone.add(gtsam.PriorFactorPose3(vertex, start.atPose3(vertex), noise.first_pose()))
+        backbone.add(gtsam.PriorFactorPose3(vertex, start.atPose3(vertex), noise.FIRST_POSE))
     backbone.push_back(factor_graph(problem.odometry))
     started = perf_counter()
     found, weights = _solve(problem, backbone, start, robust)

@@ -35,9 +35,8 @@ class Chains:
         """`odometry` leads from each vertex 0, 1, 2, ... to the next; `T_world` (n, 4, 4): their poses."""
         self._T_world = Rows(T_world)
         summed, length = np.zeros((len(T_world), 6, 6)), np.zeros(len(T_world))
-        if odometry:
-            summed[1:] = np.cumsum(carried(T_world[1:], odometry), axis=0)
-            length[1:] = np.cumsum([_length(edge) for edge in odometry])
+        summed[1:] = np.cumsum(carried(T_world[1:], odometry), axis=0)
+        length[1:] = np.cumsum([_length(edge) for edge in odometry])
         self._summed, self._length = Rows(summed), Rows(length)
         self._ends = np.unique(np.array([(edge.a, edge.b) for edge in closures], dtype=np.int64))
         self._links = self._linked(closures)
@@ -86,13 +85,12 @@ class Chains:
         """The shortest link between each two neighbouring rows of ends."""
         between = zip(*self._odometry(self._ends[:-1], self._ends[1:]), strict=True)
         links: dict[tuple[int, int], Link] = {(row, row + 1): link for row, link in enumerate(between)}
-        if closures:
-            own = carried(self._T_world.all()[[edge.b for edge in closures]], closures)
-            for edge, covariance in zip(closures, own, strict=True):
-                first, last = np.searchsorted(self._ends, sorted((edge.a, edge.b))).tolist()
-                length = _length(edge)
-                if (first, last) not in links or length < links[first, last][0]:
-                    links[first, last] = length, covariance
+        own = carried(self._T_world.all()[[edge.b for edge in closures]], closures)
+        for edge, covariance in zip(closures, own, strict=True):
+            first, last = np.searchsorted(self._ends, sorted((edge.a, edge.b))).tolist()
+            length = _length(edge)
+            if (first, last) not in links or length < links[first, last][0]:
+                links[first, last] = length, covariance
         return links
 
 

@@ -105,7 +105,8 @@ def adjoints(T_a_b: Transforms) -> Matrices:
 def carried(T_world_end: Transforms, edges: Sequence[Edge]) -> Matrices:
     """Covariances of edges in the world frame, at their second vertices."""
     turns = adjoints(T_world_end)
-    return turns @ np.linalg.inv(np.array([edge.information for edge in edges])) @ turns.transpose(0, 2, 1)
+    information = np.array([edge.information for edge in edges]).reshape(-1, 6, 6)
+    return turns @ np.linalg.inv(information) @ turns.transpose(0, 2, 1)
 
 
 @kernel("void(float64[:, ::1], float64[::1], float64[:, ::1], float64[::1], float64[::1])")

@@ -114,8 +114,7 @@ class Confirmation:
 
     def _are_consistent(self, closure: LoopClosure, others: Sequence[LoopClosure]) -> Mask:
         """(k,) which other loops are consistent with one."""
-        are_consistent: Mask = self._graph.consistent_pairs([closure, *others])[0, 1:]
-        return are_consistent
+        return self._graph.consistent_pairs([closure, *others])[0, 1:]
 
     def _near(self, keyframe_id: int) -> list[Attempted]:
         return [one for one in self._waiting if self._is_near(keyframe_id, one[1].source_id)]

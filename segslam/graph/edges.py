@@ -17,7 +17,7 @@ from jaxtyping import Float
 from scipy.sparse import csc_array
 
 from segslam.core import geometry
-from segslam.core.types import Indices, Information, Mask, Transform, Vector
+from segslam.core.types import Information, Mask, Transform, Vector
 
 Kernel = Any
 """One of gtsam.noiseModel.mEstimator; their common base is not in GTSAM's stubs."""
@@ -107,11 +107,6 @@ def rotated(odometry: Sequence[Edge], turns: Iterable[Vector]) -> list[Edge]:
     ]
 
 
-def segments(odometry: Sequence[Edge]) -> Indices:
-    """(n,) the segment of each keyframe, counted from 0; a break separates two segments."""
-    return np.cumsum([False, *(is_break(edge) for edge in odometry)])
-
-
 def is_break(edge: Edge) -> bool:
     """True if the standard deviation of a motion is above that of a break in any direction."""
     rotation, translation = largest_variances(edge.information)
@@ -131,7 +126,7 @@ def relinked(odometry: Sequence[Edge], closures: Sequence[Edge], T_world: Transf
 
     Segments that already fit the closure that joins them are not moved; segments without one follow the segment before.
     """
-    segment = segments(odometry)
+    segment = np.cumsum([False, *(is_break(edge) for edge in odometry)])  # of each keyframe, from 0
     joining = [edge for edge in compress(closures, likely) if segment[edge.a] != segment[edge.b]]
     if not joining:
         return T_world

@@ -159,7 +159,7 @@ class PoseGraph:
         if keyframe_id == 0:
             variance, num_breaks = 0.0, 0
             pose = gtsam.Pose3(geometry.nearest_transform(T_odom_keyframe))
-            self._prior.add(gtsam.PriorFactorPose3(0, pose, noise.first_pose()))
+            self._prior.add(gtsam.PriorFactorPose3(0, pose, noise.FIRST_POSE))
             self._backbone.push_back(self._prior)
         else:
             # Rounding in a long chain would stop the solver far from the optimum.

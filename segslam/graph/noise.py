@@ -20,20 +20,15 @@ CLOSURE_SIGMA_DEG = 0.08
 """Measured (simulated 06): smallest rotation noise of a closure (degrees)."""
 
 DEGREES_OF_FREEDOM = 6
-FIRST_POSE_SIGMA = 1e-4  # chosen (rad, m): holds the world in place, far below any other noise and above rounding
+FIRST_POSE = gtsam.noiseModel.Isotropic.Sigma(DEGREES_OF_FREEDOM, 1e-4)
+"""Noise of the prior on the first keyframe. Chosen (rad, m): holds the world in place, far below any other noise and
+above rounding."""
 LEAST_STEP_M = 0.1  # chosen: odometry between two scans of a standing sensor jitters by centimetres
 
 UNKNOWN_MOTION = np.diag(geometry.tangent(rotation_rad=math.pi, translation_m=1000.0) ** -2.0)
 """Information of an unknown motion. Chosen: standard deviations of half a turn and a kilometre, more than any break."""
-
-
 CERTAIN = 1e12 * np.eye(6)
 """Information of an exactly known pose."""
-
-
-def first_pose() -> gtsam.noiseModel.Base:
-    """Noise of the prior on the first keyframe, which fixes the world frame."""
-    return gtsam.noiseModel.Isotropic.Sigma(DEGREES_OF_FREEDOM, FIRST_POSE_SIGMA)
 
 
 def odometry_information(travel_m: float, T_a_b: Transform, config: GraphConfig) -> Information:

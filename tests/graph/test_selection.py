@@ -12,7 +12,7 @@ from segslam.graph import gnc, levenberg_marquardt
 from segslam.graph.closure_pairs import consistent_pairs, largest_consistent, neighbours
 from segslam.graph.edges import Edge, factor_graph
 from segslam.graph.gnc import TruncatedProblem, select_consistent, settle, settle_from
-from segslam.graph.noise import first_pose, inlier_bound, odometry_information
+from segslam.graph.noise import FIRST_POSE, inlier_bound, odometry_information
 
 BOUND = inlier_bound(0.99, error_allowance=3.0)
 HEADINGS = np.linspace(0.0, 4.0 * np.pi, 160)
@@ -42,7 +42,7 @@ def problem_of(closures: list[Edge]) -> tuple[TruncatedProblem, gtsam.Values, np
         Edge(i, i + 1, T, odometry_information(geometry.distance(T), T, GraphConfig())) for i, T in enumerate(motions)
     ]
     trusted = factor_graph(odometry)
-    trusted.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(TRUTH[0]), first_pose()))
+    trusted.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(TRUTH[0]), FIRST_POSE))
     values = gtsam.Values()
     for i, T_world in enumerate(TRUTH):
         values.insert(i, gtsam.Pose3(T_world))

@@ -1,6 +1,6 @@
 """Stamps, in nanoseconds since 1970 or any other start, from texts and dates."""
 
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from decimal import Decimal
 
 from segslam.core.errors import brief
@@ -36,5 +36,4 @@ def dated_nanoseconds(text: str) -> int:
 def stamp_of(moment: datetime) -> int:
     """The stamp (ns) of a moment; one without a time zone is in UTC."""
     aware = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-    since = aware - datetime(1970, 1, 1, tzinfo=UTC)
-    return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
+    return (aware - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000

@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import MAXYEAR, MINYEAR, UTC, date, datetime, time, timedelta
 from functools import reduce
 from operator import xor
@@ -113,12 +114,10 @@ def _time(file: Path, number: int, text: str) -> timedelta:
 
 def _date(words: Sequence[str]) -> date | None:
     """The date of RMC (ddmmyy) or ZDA; None if there is none."""
-    try:
+    with suppress(ValueError):
         if words[0][-3:] == "RMC" and len(words) > 9:
             year = int(words[9][4:6])
             return date(year + (1900 if year > 79 else 2000), int(words[9][2:4]), int(words[9][:2]))
         if words[0][-3:] == "ZDA" and len(words) > 4 and MINYEAR < int(words[4]) < MAXYEAR:
             return date(int(words[4]), int(words[3]), int(words[2]))
-    except ValueError:
-        return None
     return None

@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from segslam.core import geometry
 from segslam.core.errors import brief
 from segslam.core.pose_files import read_poses
-from segslam.core.trajectory import ROTATION_TOLERANCE, lidar_from_camera
+from segslam.core.trajectory import ROTATION_TOLERANCE, from_matrices, lidar_from_camera
 from segslam.core.types import BadScan, Indices, SegslamError, Trajectory, Transform
 from segslam.core.whole_files import read_text
 from segslam.labels.label_files import open_labels
@@ -160,8 +159,7 @@ def _rigid(texts: list[str], place: str) -> Transform:
         raise SegslamError(f"{place}: expected 12 numbers, a 3x4 matrix by rows ({brief(str(error))})") from error
     if not np.isfinite(matrix).all():
         raise SegslamError(f"{place}: all numbers must be finite")
-    T_camera_lidar = geometry.nearest_transform(matrix)
-    off = np.abs(matrix[:, :3] - T_camera_lidar[:3, :3]).max()
+    (T_camera_lidar,), (off,) = from_matrices(matrix)
     if not off <= ROTATION_TOLERANCE:
         raise SegslamError(
             f"{place}: the 3x3 part is not a rotation (error {off:.3g}); give the transform from LiDAR to camera "

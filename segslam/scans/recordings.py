@@ -52,9 +52,9 @@ REMEDIES = {
     "helipr": "; give --sequence Ouster, Velodyne, Avia or Aeva",
     "rosbag": "; after a crash, `rosbag reindex FILE` (ROS 1) or `ros2 bag reindex FOLDER` (ROS 2) makes its index",
 }
-READ_HERE = {"boreas": "", "helipr": "", "ncd": "scan_folder", "nclt": "scans_dir"}
-"""Readers of kiss_icp that find scans and true poses, and their attribute with the folder of the scans if the names of
-files lack it. The files are read here, with their times and intensities."""
+READ_HERE = {"generic": "", "boreas": "", "helipr": "", "ncd": "scan_folder", "nclt": "scans_dir"}
+"""Kinds of data whose files are read here, with times and intensities. Except for the first, a reader of kiss_icp finds
+them and the true poses: its attribute with the folder of the scans, if the names of files lack it."""
 FOREIGN_ERRORS = (Exception, SystemExit)
 """Readers of other projects raise anything for damaged data; it becomes an error that names the file."""
 
@@ -134,29 +134,15 @@ class Recording(Dataset):
 
     def _file(self, index: int) -> Path:
         """The file of a scan; a name with its number for recordings of many scans."""
-        files = getattr(self._loader, "scan_files", None)
+        files = self._loader if self._kind == "generic" else getattr(self._loader, "scan_files", None)
         folder = Path(getattr(self._loader, READ_HERE.get(self._kind, ""), ""))
         return folder / str(files[index]) if files is not None else self._source / f"{index:06d}"
 
 
-class ScanFolder:
-    """The scans of a folder: all files of one format, without hidden ones, by the stamps or the numbers in names."""
-
-    def __init__(self, folder: Path) -> None:
-        self.scan_files = scan_files(folder)
-
-    def __len__(self) -> int:
-        return len(self.scan_files)
-
-    def __getitem__(self, index: int) -> Cloud:
-        """Raises BadScan, naming the file."""
-        return read_file(self.scan_files[index])
-
-
 def scan_files(folder: Path) -> list[Path]:
-    """The files with scans in a folder; .npy files are scans only if no file has another format.
+    """The files with scans in a folder, without hidden ones, by the stamps or the numbers in their names.
 
-    Raises SegslamError for scans of several formats.
+    .npy files are scans only if no file has another format. Raises SegslamError for scans of several formats.
     """
     found = [file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
     files = [file for file in found if file.is_file()]
@@ -205,10 +191,10 @@ def _opened(source: DataSource) -> tuple[str, Path, Any]:
 
 
 def _loader(kind: str, source: Path, sequence: str, topic: str) -> Any:
-    """The reader of a kind of data: scans by their number; libraries of recordings are imported for their kind only."""
+    """The reader of a kind of data: scans by number, or their files. Libraries are imported for their kind only."""
     match kind:
         case "generic":
-            return ScanFolder(source)
+            return scan_files(source)
         case "mcap" | "rosbag":
             from segslam.scans.messages import BagMessages, McapMessages
             from segslam.scans.point_cloud2 import MessageClouds

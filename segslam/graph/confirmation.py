@@ -19,7 +19,7 @@ from segslam.core import geometry
 from segslam.core.config import Config
 from segslam.core.probabilities import log_chance, log_odds
 from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Mask, Rejected, RejectReason
-from segslam.graph import Graph
+from segslam.graph import PoseGraph
 from segslam.graph.motions import PLACE_M
 from segslam.verification.score import MISLED, log_odds_of_all
 
@@ -34,7 +34,7 @@ Attempted = tuple[LoopCandidate, LoopClosure]
 class Confirmation:
     """The registrations that are not yet confirmed, and their confirmation by later ones."""
 
-    def __init__(self, graph: Graph, config: Config) -> None:
+    def __init__(self, graph: PoseGraph, config: Config) -> None:
         self._graph = graph
         self._radius_m = config.proximity.base_radius_m
         self._least_odds = log_odds_of_all(config.verify)

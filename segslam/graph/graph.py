@@ -68,6 +68,9 @@ class PoseGraph:
     The world frame is the odometry frame of the first keyframe.
     """
 
+    _first = 0
+    """Vertex of the first keyframe; those before it belong to a map, and their ids are negative."""
+
     def __init__(self, config: GraphConfig) -> None:
         self._configured = config
         self._config = config
@@ -106,17 +109,17 @@ class PoseGraph:
     @property
     def num_keyframes(self) -> int:
         """Number of keyframes added so far."""
-        return len(self._travel_m)
+        return len(self._travel_m) - self._first
 
     @property
     def travel_m(self) -> Vector:
         """(n,) travel of each keyframe, by id; each break is `BREAK_LENGTH_M` long."""
-        return self._travel_m.all()
+        return self._travel_m.all()[self._first :]
 
     @property
     def num_breaks(self) -> Indices:
         """(n,) number of breaks before each keyframe, by id."""
-        return self._num_breaks.all()
+        return self._num_breaks.all()[self._first :]
 
     @property
     def motion_variance(self) -> Vector:
@@ -125,12 +128,12 @@ class PoseGraph:
         Where the motion has no information of its own, the variance is by the configured noise: the noise that loops
         raise covers the drift of a whole drive, not of a motion.
         """
-        return self._motion_variance.all()
+        return self._motion_variance.all()[self._first :]
 
     @property
     def T_world_keyframes(self) -> Transforms:  # noqa: N802
         """(n, 4, 4) poses by id: the last estimate, continued by odometry for newer keyframes."""
-        return self._T_world.all()
+        return self._T_world.all()[self._first :]
 
     @property
     def is_due(self) -> bool:
@@ -156,7 +159,8 @@ class PoseGraph:
         if keyframe_id != self.num_keyframes:
             expected = f"expected {self.num_keyframes}, got {keyframe_id}"
             raise ValueError(f"keyframe ids count from 0 without gaps: {expected}")
-        if keyframe_id == 0:
+        vertex = keyframe_id + self._first
+        if vertex == 0:
             variance, num_breaks = 0.0, 0
             pose = gtsam.Pose3(geometry.nearest_transform(T_odom_keyframe))
             self._prior.add(gtsam.PriorFactorPose3(0, pose, noise.FIRST_POSE))
@@ -165,22 +169,24 @@ class PoseGraph:
             # Rounding in a long chain would stop the solver far from the optimum.
             T_last_new = geometry.nearest_transform(geometry.inverse(self._T_odom_last) @ T_odom_keyframe)
             way_m = travel_m - self._path_m.all()[-1]
+            if keyframe_id == 0:
+                information = np.zeros((6, 6))  # nothing is known of its motion from a map
             known, configured = (
                 noise.motion_information(information)
                 if information is not None
                 else noise.odometry_information(way_m, T_last_new, config)
                 for config in (self._config, self._configured)
             )
-            edge = Edge(keyframe_id - 1, keyframe_id, T_last_new, known)
+            edge = Edge(vertex - 1, vertex, T_last_new, known)
             self._has_own_information.append(information is not None)
             self._has_breaks |= is_break(edge)  # also where loops show that the odometry errs more
-            num_breaks = int(self.num_breaks[-1]) + (information is not None and is_break(edge))
+            num_breaks = int(self._num_breaks.all()[-1]) + (information is not None and is_break(edge))
             self._odometry.append(edge)
             self._rejected.append(False)
             self._backbone.add(edge.factor())
             variance = largest_variances(configured)[1]
-            pose = self._values.atPose3(keyframe_id - 1).compose(gtsam.Pose3(T_last_new))
-        self._values.insert(keyframe_id, pose)
+            pose = self._values.atPose3(vertex - 1).compose(gtsam.Pose3(T_last_new))
+        self._values.insert(vertex, pose)
         self._T_world.append(pose.matrix())
         if self._chains is not None:
             self._chains.add(pose.matrix(), self._odometry[-1])
@@ -204,8 +210,8 @@ class PoseGraph:
         By the shortest chain of odometry and of the loops that the last estimate kept (`Chains`).
         """
         if self._chains is None:
-            self._chains = Chains(self.T_world_keyframes, self._kept_odometry(), self._kept())
-        return self._chains.covariances(keyframe_id, others)
+            self._chains = Chains(self._T_world.all(), self._kept_odometry(), self._kept())
+        return self._chains.covariances(keyframe_id + self._first, others + self._first)
 
     def consistent_pairs(self, closures: Sequence[LoopClosure]) -> Pairs:
         """(k, k) which two closures are consistent with each other and the odometry between their ends.
@@ -300,7 +306,7 @@ class PoseGraph:
 
     def _solve_final(self) -> float:
         """Take the final solution; returns its error."""
-        drive = Drive(self._prior, self._closures, self.travel_m, self._inlier_bound)
+        drive = Drive(self._prior, self._closures, self._travel_m.all(), self._inlier_bound)
         pairwise = self._config.final != "gnc"
         final = solve_final(drive, self._odometry, self._values, np.array(self._rejected, bool), pairwise=pairwise)
         self._rejected = final.rejected.tolist()
@@ -328,7 +334,7 @@ class PoseGraph:
 
     def write_g2o(self, path: Path) -> None:
         """Poses, odometry and closures (without robust kernel) as g2o text."""
-        write_g2o(path, G2oGraph(dict(enumerate(self.T_world_keyframes)), self._kept_odometry() + self._closures))
+        write_g2o(path, G2oGraph(dict(enumerate(self._T_world.all())), self._kept_odometry() + self._closures))
 
     def write_adjusted_g2o(self, path: Path) -> None:
         """Poses and all edges of the last estimate, those of the adjustment included, as g2o text.
@@ -337,15 +343,16 @@ class PoseGraph:
         """
         odometry, measured, factors = self._adjustment or (self._kept_odometry(), [], (1.0, 1.0))
         edges = weighted_edges(odometry, self._kept(), measured, factors, self._values, self._kernel)
-        write_g2o(path, G2oGraph(dict(enumerate(self.T_world_keyframes)), edges))
+        write_g2o(path, G2oGraph(dict(enumerate(self._T_world.all())), edges))
 
     def _edge(self, closure: LoopClosure) -> Edge:
         ids = closure.target_id, closure.source_id
         for keyframe_id in ids:
-            if not 0 <= keyframe_id < self.num_keyframes:
+            if not -self._first <= keyframe_id < self.num_keyframes:
                 raise SegslamError(f"the pose graph holds keyframes 0 to {self.num_keyframes - 1}, not {keyframe_id}")
+        a, b = (keyframe_id + self._first for keyframe_id in ids)
         T_target_source = geometry.nearest_transform(closure.T_target_source)
-        return Edge(*ids, T_target_source, noise.closure_information(closure.information))
+        return Edge(a, b, T_target_source, noise.closure_information(closure.information))
 
     def _kept(self) -> list[Edge]:
         """The closures that the last estimate kept."""
@@ -364,7 +371,7 @@ class PoseGraph:
             return self._values
         odometry = self._kept_odometry()
         likely = largest_consistent(consistent_pairs(odometry, self._closures, self._inlier_bound))
-        return values_of(relinked(odometry, self._closures, self.T_world_keyframes, likely))
+        return values_of(relinked(odometry, self._closures, self._T_world.all(), likely))
 
     def _take(self, values: gtsam.Values, weights: Iterable[float]) -> None:
         """Store poses, and the weights of all closures so far."""
@@ -373,10 +380,10 @@ class PoseGraph:
         self._chains = None
 
     def _estimate(self, error: float) -> GraphEstimate:
-        pairs = [(closure.b, closure.a) for closure in self._closures]
+        pairs = [(closure.b - self._first, closure.a - self._first) for closure in self._closures]
         return GraphEstimate(
             dict(enumerate(self.T_world_keyframes)),
             float(error),
             dict(zip(pairs, self._weights, strict=True)),
-            {(edge.a, edge.b): 0.0 for edge in compress(self._odometry, self._rejected)},
+            {(edge.a - self._first, edge.b - self._first): 0.0 for edge in compress(self._odometry, self._rejected)},
         )

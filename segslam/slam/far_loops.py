@@ -16,7 +16,7 @@ from segslam.candidates.proximity import LEAST_PROBABILITY, Nearness, nearness
 from segslam.core.config import Config
 from segslam.core.threads import Stopwatch
 from segslam.core.types import LoopAttempt, LoopCandidate, LoopClosure, Rejected, RejectReason, Transform
-from segslam.graph import Graph
+from segslam.graph import PoseGraph
 from segslam.graph.confirmation import Confirmation
 from segslam.registration.prepared import PreparedScan
 from segslam.slam.recognition import MAX_PLACES, recognise
@@ -33,7 +33,7 @@ class FarLoops:
     def __init__(
         self,
         config: Config,
-        graph: Graph,
+        graph: PoseGraph,
         prepared: Callable[[int], PreparedScan],
         confirmation: Confirmation,
         forbidden: frozenset[tuple[int, int]],

@@ -19,7 +19,7 @@ from segslam.core.types import (
     RejectReason,
     Transform,
 )
-from segslam.graph import Graph
+from segslam.graph import PoseGraph
 from segslam.graph.chains import far_from_prior, prior_gate
 from segslam.graph.confirmation import Confirmation
 from segslam.keyframes import Submaps
@@ -44,7 +44,7 @@ class LoopCloser:
     """Proposes loops from the poses of the graph, and adds the verified ones to the graph."""
 
     def __init__(
-        self, config: Config, graph: Graph, clouds: CloudOf, labeller: Labeller, edits: LoopEdits, *, is_known: bool
+        self, config: Config, graph: PoseGraph, clouds: CloudOf, labeller: Labeller, edits: LoopEdits, *, is_known: bool
     ) -> None:
         """`clouds` provides the points of keyframes; `labeller` computes geometric labels of gathered clouds.
 

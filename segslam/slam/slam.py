@@ -31,7 +31,7 @@ from segslam.core.types import (
     Trajectory,
     Transform,
 )
-from segslam.graph import Graph, PoseGraph
+from segslam.graph import AnchoredGraph, PoseGraph
 from segslam.keyframes import Clouds, CloudStore, downsample_keyframe
 from segslam.labels import geometric_labels
 from segslam.labels.label_files import computed
@@ -99,7 +99,7 @@ class Slam:
         state = "finished" if self._is_finished else "running"
         return f"Slam({', '.join(counted(number, thing) for thing, number in numbers.items())}, {state})"
 
-    def _new_graph(self) -> Graph:
+    def _new_graph(self) -> PoseGraph:
         return PoseGraph(self.config.graph)
 
     def keep_clouds_in(self, clouds: Clouds) -> None:
@@ -177,7 +177,7 @@ class Slam:
         odometry = self._odometry()
         rows = np.array(self._keyframe_rows)
         adjusted = None
-        if isinstance(self.graph, PoseGraph):  # an existing map stays as it is
+        if not isinstance(self.graph, AnchoredGraph):  # an existing map stays as it is
             adjusted = adjust(
                 self.graph,
                 estimate,

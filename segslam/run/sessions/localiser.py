@@ -14,7 +14,7 @@ from segslam.core.threads import Stopwatch
 from segslam.core.trajectory import nearest_rows, travelled_m
 from segslam.core.types import REJECTED_WEIGHT, GraphEstimate, LoopAttempt, Placement, Rejected, Step, Vector
 from segslam.core.whole_files import expanded
-from segslam.graph import AnchoredGraph, Graph
+from segslam.graph import AnchoredGraph
 from segslam.odometry.sweep import Odometry
 from segslam.output.finished import FinishedRun
 from segslam.output.georeferenced import take_over
@@ -52,7 +52,7 @@ class Localiser(Slam):
         self._placer = Placer(self.config, locator, self._anchored, self._loops.submaps)
         self._placed: tuple[tuple[Placement, ...], Rejected | None] = (), None
 
-    def _new_graph(self) -> Graph:
+    def _new_graph(self) -> AnchoredGraph:
         self._anchored = AnchoredGraph(self.config.graph)
         return self._anchored
 

@@ -13,10 +13,10 @@ import gtsam
 import numpy as np
 
 from segslam.core import geometry
+from segslam.core.trajectory import Poses
 from segslam.graph.edges import (
     Edge,
     Kernel,
-    Transforms,
     factor_graph,
     is_break,
     joined,
@@ -116,7 +116,7 @@ def _scaled(edges: Sequence[Edge], factor: float) -> list[Edge]:
     return [replace(edge, information=edge.information / factor**2) for edge in edges]
 
 
-def _simulated(edges: Sequence[Edge], T_world: Transforms, rng: np.random.Generator) -> list[Edge]:
+def _simulated(edges: Sequence[Edge], T_world: Poses, rng: np.random.Generator) -> list[Edge]:
     """The edges as measured between these poses with errors as their information claims."""
     errors = rng.standard_normal((len(edges), 6))
     return [

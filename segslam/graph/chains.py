@@ -14,11 +14,11 @@ from scipy.sparse.csgraph import dijkstra
 
 from segslam.core import geometry
 from segslam.core.config import Config, GraphConfig
-from segslam.core.trajectory import Rows
+from segslam.core.trajectory import Poses, Rows
 from segslam.core.types import Indices, Information, LoopCandidate, Rejected, RejectReason, Transform, Vector
 from segslam.graph import noise
 from segslam.graph.closure_pairs import Matrices, adjoints, carried
-from segslam.graph.edges import Edge, Transforms
+from segslam.graph.edges import Edge
 from segslam.verification.trial import Gate
 
 Link = tuple[float, Information]
@@ -31,7 +31,7 @@ class Chains:
     Chains branch at the ends of closures only, so the searched graph has no other vertices.
     """
 
-    def __init__(self, T_world: Transforms, odometry: Sequence[Edge], closures: Sequence[Edge]) -> None:
+    def __init__(self, T_world: Poses, odometry: Sequence[Edge], closures: Sequence[Edge]) -> None:
         """`odometry` leads from each vertex 0, 1, 2, ... to the next; `T_world` (n, 4, 4): their poses."""
         self._T_world = Rows(T_world)
         summed, length = np.zeros((len(T_world), 6, 6)), np.zeros(len(T_world))

@@ -26,8 +26,9 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core.kernels import kernel
+from segslam.core.trajectory import Poses
 from segslam.core.types import Indices, Mask, Vector
-from segslam.graph.edges import Edge, Transforms, chained
+from segslam.graph.edges import Edge, chained
 from segslam.registration.cliques import maximum_cliques, pack_rows
 
 MAX_PAIRED = 5_000
@@ -94,7 +95,7 @@ def _ends_m(closures: Sequence[Edge], travel_m: Vector) -> Float[np.ndarray, "_ 
     return travel_m[np.array([(edge.a, edge.b) for edge in closures], dtype=np.int64).reshape(-1, 2)]
 
 
-def adjoints(T_a_b: Transforms) -> Matrices:
+def adjoints(T_a_b: Poses) -> Matrices:
     """(k, 6, 6) adjoint matrices, which map tangents of b to tangents of a."""
     whole = np.zeros((len(T_a_b), 6, 6))
     whole[:, :3, :3] = whole[:, 3:, 3:] = T_a_b[:, :3, :3]
@@ -102,7 +103,7 @@ def adjoints(T_a_b: Transforms) -> Matrices:
     return whole
 
 
-def carried(T_world_end: Transforms, edges: Sequence[Edge]) -> Matrices:
+def carried(T_world_end: Poses, edges: Sequence[Edge]) -> Matrices:
     """Covariances of edges in the world frame, at their second vertices."""
     turns = adjoints(T_world_end)
     information = np.array([edge.information for edge in edges]).reshape(-1, 6, 6)

@@ -13,15 +13,14 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from jaxtyping import Float
 from scipy.sparse import csc_array
 
 from segslam.core import geometry
+from segslam.core.trajectory import Poses
 from segslam.core.types import Information, Mask, Transform, Vector
 
 Kernel = Any
 """One of gtsam.noiseModel.mEstimator; their common base is not in GTSAM's stubs."""
-Transforms = Float[np.ndarray, "_ 4 4"]
 BREAK_M, BREAK_DEG = 1.0, 5.0
 """A motion with a larger standard deviation is a break. Chosen: 100 m of healthy odometry have a tenth of it.
 A drive whose heading is as unsure is not placed by position fixes."""
@@ -88,13 +87,13 @@ def values_of(T_world: Iterable[Transform], keys: Iterable[int] | None = None) -
     return values
 
 
-def poses_by_id(values: gtsam.Values) -> Transforms:
+def poses_by_id(values: gtsam.Values) -> Poses:
     """All poses, sorted by key."""
     rows = np.asarray(gtsam.utilities.extractPose3(values)).reshape(-1, 12)
     return geometry.transforms(rows[:, :9].reshape(-1, 3, 3), rows[:, 9:])
 
 
-def chained(odometry: Sequence[Edge]) -> Transforms:
+def chained(odometry: Sequence[Edge]) -> Poses:
     """(n, 4, 4) poses by the motions alone, from each vertex 0, 1, 2, ... to the next, in the frame of the first."""
     return np.array(list(accumulate((edge.T_a_b for edge in odometry), np.matmul, initial=np.eye(4))))
 
@@ -121,7 +120,7 @@ def largest_variances(information: Information) -> tuple[float, float]:
     return float(rotation), float(translation)
 
 
-def relinked(odometry: Sequence[Edge], closures: Sequence[Edge], T_world: Transforms, likely: Mask) -> Transforms:
+def relinked(odometry: Sequence[Edge], closures: Sequence[Edge], T_world: Poses, likely: Mask) -> Poses:
     """(n, 4, 4) poses in which `likely` closures (k,) join the segments of a drive.
 
     Segments that already fit the closure that joins them are not moved; segments without one follow the segment before.

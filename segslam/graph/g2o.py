@@ -16,10 +16,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation as ScipyRotation
 
 from segslam.core.errors import brief
-from segslam.core.trajectory import LARGEST, NOT_FINITE, ROTATION_TOLERANCE, from_quaternions
+from segslam.core.trajectory import LARGEST, NOT_FINITE, ROTATION_TOLERANCE, Poses, from_quaternions
 from segslam.core.types import Indices, SegslamError, Transform
 from segslam.core.whole_files import read_text
-from segslam.graph.edges import Edge, Transforms
+from segslam.graph.edges import Edge
 
 VERTEX, EDGE, FIX = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "FIX"
 NUM_FIELDS = {VERTEX: 8, EDGE: 30, FIX: 1}
@@ -140,7 +140,7 @@ def _complaint(tag: str, num_fields: int) -> str:
     return f"{tag} takes {NUM_FIELDS[tag]} numbers, found {num_fields}; correct or remove the line"
 
 
-def _poses(table: _Table) -> Transforms:
+def _poses(table: _Table) -> Poses:
     """Those of the first seven numbers of each row."""
     poses, off = from_quaternions(np.array([row[:7] for row in table.numbers]).reshape(-1, 7))
     for row in np.flatnonzero(off > ROTATION_TOLERANCE):

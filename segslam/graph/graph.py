@@ -17,7 +17,7 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import GraphConfig
-from segslam.core.trajectory import Rows
+from segslam.core.trajectory import Poses, Rows
 from segslam.core.types import (
     REJECTED_WEIGHT,
     GraphEstimate,
@@ -34,7 +34,6 @@ from segslam.graph.chains import Chains
 from segslam.graph.closure_pairs import MAX_PAIRED, Matrices, Pairs, consistent_pairs, largest_consistent
 from segslam.graph.edges import (
     Edge,
-    Transforms,
     factor_graph,
     is_break,
     joined,
@@ -131,7 +130,7 @@ class PoseGraph:
         return self._motion_variance.all()[self._first :]
 
     @property
-    def T_world_keyframes(self) -> Transforms:  # noqa: N802
+    def T_world_keyframes(self) -> Poses:  # noqa: N802
         """(n, 4, 4) poses by id: the last estimate, continued by odometry for newer keyframes."""
         return self._T_world.all()[self._first :]
 

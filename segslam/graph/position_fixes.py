@@ -8,8 +8,9 @@ import numpy as np
 from scipy.sparse.linalg import splu
 
 from segslam.core import geometry
+from segslam.core.trajectory import Poses
 from segslam.core.types import Indices, Points
-from segslam.graph.edges import Edge, Transforms, factor_graph, jacobian, poses_by_id, values_of
+from segslam.graph.edges import Edge, factor_graph, jacobian, poses_by_id, values_of
 from segslam.graph.levenberg_marquardt import search
 
 GAUGE = geometry.tangent(rotation_rad=[0.1, 0.1, 10.0], translation_m=1e4)
@@ -23,7 +24,7 @@ LEAST_PRECISION = 1e-12
 class PositionedGraph:
     """Poses of a drive in a frame of the Earth, from the edges of its graph and measured positions."""
 
-    def __init__(self, edges: Sequence[Edge], T_map: Transforms) -> None:
+    def __init__(self, edges: Sequence[Edge], T_map: Poses) -> None:
         """`edges` of a graph whose optimum are the poses `T_map` (k, 4, 4).
 
         Every edge gets its value at this optimum: the sum of squares then has the same second derivatives as the graph,
@@ -43,9 +44,7 @@ class PositionedGraph:
         covariance = derivatives @ self._information.solve(np.ascontiguousarray(derivatives.T))
         return (covariance + covariance.T) / 2
 
-    def solve(
-        self, start: Transforms, keys: Indices, points: Points, positions: Points, precisions: Points
-    ) -> Transforms:
+    def solve(self, start: Poses, keys: Indices, points: Points, positions: Points, precisions: Points) -> Poses:
         """(k, 4, 4) poses for fixes that measure `positions` (n, 3) of `points` (n, 3) in the frames of poses `keys`.
 
         `precisions` (n, 3): inverse variance of each axis (1 / m^2); 0 for an unknown one. Raises Unsolvable.

@@ -133,7 +133,7 @@ def far_from_prior(
     bound = noise.inlier_bound(error_allowance=config.error_allowance)
     slack = geometry.tangent(rotation_rad=slack_m / noise.TURN_M, translation_m=slack_m) ** 2 / bound
     off = geometry.log(geometry.inverse(candidate.T_target_source_prior) @ T_target_source)
-    covariance = candidate.covariance + np.diag(noise.closure_sigmas() ** 2 + slack)
+    covariance = candidate.covariance + (noise.CLOSURE_NOISE + np.diag(slack))
     chi2 = float(off @ np.linalg.solve(covariance, off))
     if chi2 <= bound:
         return None

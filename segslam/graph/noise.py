@@ -9,7 +9,7 @@ from scipy.special import chdtri
 from segslam.core import geometry
 from segslam.core.config import GraphConfig
 from segslam.core.probabilities import INLIER_PROBABILITY
-from segslam.core.types import Information, Tangent, Transform
+from segslam.core.types import Information, Transform
 from segslam.graph.edges import Kernel
 
 TURN_M = 5.0
@@ -18,6 +18,10 @@ CLOSURE_SIGMA_M = 0.04
 """Measured (simulated 06): smallest translation noise of a closure (m)."""
 CLOSURE_SIGMA_DEG = 0.08
 """Measured (simulated 06): smallest rotation noise of a closure (degrees)."""
+CLOSURE_NOISE = np.diag(
+    geometry.tangent(rotation_rad=math.radians(CLOSURE_SIGMA_DEG), translation_m=CLOSURE_SIGMA_M) ** 2
+)
+"""Smallest covariance of any closure."""
 
 DEGREES_OF_FREEDOM = 6
 FIRST_POSE = gtsam.noiseModel.Isotropic.Sigma(DEGREES_OF_FREEDOM, 1e-4)
@@ -67,13 +71,7 @@ def closure_information(information: Information) -> Information:
     Raises ValueError if `information` is not symmetric positive semidefinite.
     """
     _check(information, "closure")
-    covariance = np.diag(closure_sigmas() ** 2)
-    return geometry.with_covariance(information, covariance) + 1e-10 * np.linalg.inv(covariance)
-
-
-def closure_sigmas() -> Tangent:
-    """Smallest standard deviations of any closure."""
-    return geometry.tangent(rotation_rad=math.radians(CLOSURE_SIGMA_DEG), translation_m=CLOSURE_SIGMA_M)
+    return geometry.with_covariance(information, CLOSURE_NOISE) + 1e-10 * np.linalg.inv(CLOSURE_NOISE)
 
 
 def _check(information: Information, what: str) -> None:

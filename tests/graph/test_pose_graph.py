@@ -114,7 +114,7 @@ def test_closures_pull_the_drift_back(robust: str) -> None:
 def test_a_closure_points_from_source_to_target(monkeypatch: pytest.MonkeyPatch) -> None:
     """A closure on a chain without information determines the pose: T_world_source = T_world_target T_target_source."""
     loose = GraphConfig(odometry_sigma_m=100.0, odometry_sigma_deg=90.0, robust="none")
-    monkeypatch.setattr(noise, "CLOSURE_SIGMA_M", 1e-3)
+    monkeypatch.setattr(noise, "CLOSURE_NOISE", np.diag(noise_of(1e-3, 0.08) ** 2))
     T_target_source = geometry.transform(geometry.yaw(0.7), [1.0, 2.0, 0.3])
     graph = graph_of(circle(5, rounds=0.1), [closure(4, 0, T_target_source)], loose)
     graph.optimize()

@@ -46,7 +46,9 @@ def merge(
     from segslam.run.sessions.recorded import read_sessions
 
     sessions = read_sessions(runs)
-    settings = changed_config(sessions[0].log, file=changes.config, settings=changes.overrides(), what="a merged run")
+    settings = changed_config(
+        sessions[0].run.log, file=changes.config, settings=changes.overrides(), what="a merged run"
+    )
     terminal.compile_kernels()
     with ExitStack() as stack:
         folder = make_folder(out, overwrite=changes.overwrite, inputs=runs)

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from xml.etree import ElementTree as Xml
 
 import numpy as np
@@ -17,15 +17,13 @@ from segslam.core.config import MapConfig, load_config
 from segslam.core.processes import Progress, no_progress
 from segslam.core.types import Indices, Keyframe, SegslamError, Transform
 from segslam.core.whole_files import all_expanded, cannot_write, expanded, whole_file
+from segslam.gnss import Origin, geodetic_from_enu
 from segslam.output.finished import read_corrections, read_result
-from segslam.output.folder import PLACE_ON_GLOBE
+from segslam.output.georeferenced import Globe, read_globe
 from segslam.output.log import RunLog, read_log
-from segslam.output.map.write import check_files, write_map
+from segslam.output.map.write import check_names, write_map
+from segslam.output.report import BEFORE_AFTER, draw_before_after
 from segslam.slam.slam_result import SlamResult
-
-if TYPE_CHECKING:
-    from segslam.gnss import Origin
-    from segslam.output.georeferenced import Globe
 
 PROJECTOR_INFO = "map_projector_info.yaml"
 """Name of Autoware's file with the origin of a map."""
@@ -55,20 +53,14 @@ def write_maps(
     `show` passes items on, and shows their number and a title.
     Raises SegslamError if the run did not finish or a name has an unknown extension, WorkFailed if the disk is full.
     """
-    from segslam.output.report import BEFORE_AFTER, draw_before_after
-
     started = perf_counter()
     folder = log.path.parent
-    globe = None
-    if (folder / PLACE_ON_GLOBE).exists():
-        from segslam.output.georeferenced import read_globe
-
-        globe = read_globe(folder)
+    globe = read_globe(folder)
     origin = None if globe is None else globe.origin
     if twice := [file for file in files if files.count(file) > 1]:
         raise SegslamError(f"{twice[0]}: given twice; give each file once")
     of_map = [file for file in files if file.name != BEFORE_AFTER and not is_track(file)]
-    check_files(of_map, origin=origin, others=KINDS)
+    check_names(of_map, origin=origin, others=KINDS)
     result = read_result(log)
     with ExitStack() as complete:  # moves each file to its name at the end, after a failure none
         for file in files:
@@ -92,7 +84,7 @@ def write_maps(
 
 
 def _placed(
-    log: RunLog, result: SlamResult, globe: "Globe | None", show: Progress
+    log: RunLog, result: SlamResult, globe: Globe | None, show: Progress
 ) -> Iterator[tuple[Keyframe, Transform]]:
     """Each keyframe of known pose, in the world or on the globe, its points corrected as in the adjustment."""
     num, num_read = len(result.estimate.T_world_keyframe), len(result.keyframe_rows)
@@ -113,7 +105,7 @@ def is_track(file: Path) -> bool:
     return file.suffix.lower() in KINDS or file.name == PROJECTOR_INFO
 
 
-def track(file: Path, globe: "Globe | None", stamp_ns: Indices, *, name: str, cuts: Sequence[int] = ()) -> bytes:
+def track(file: Path, globe: Globe | None, stamp_ns: Indices, *, name: str, cuts: Sequence[int] = ()) -> bytes:
     """The content of a file with the trajectory of a run, by the extension of its name.
 
     `stamp_ns` (n,): times of the scans, which GPX has if they are later than the year 2000; `name` of the track; it has
@@ -123,8 +115,6 @@ def track(file: Path, globe: "Globe | None", stamp_ns: Indices, *, name: str, cu
         raise SegslamError(f"{file}: the run has no place on the globe; `segslam georeference RUN --gnss FIXES` first")
     if file.name == PROJECTOR_INFO:
         return _projector_info(globe.origin)
-    from segslam.gnss import geodetic_from_enu
-
     places = geodetic_from_enu(globe.T_enu_lidar[:, :3, 3], globe.origin)
     rows = [  # 1e-9 degrees are 0.1 mm
         [round(longitude, 9), round(latitude, 9), round(height_m, 3)]
@@ -186,7 +176,7 @@ def _xml(root: Xml.Element) -> bytes:
     return content + b"\n"
 
 
-def _projector_info(origin: "Origin") -> bytes:
+def _projector_info(origin: Origin) -> bytes:
     """A local frame tangent to the ellipsoid, in which exported clouds other than LAS and LAZ are."""
     return (
         "projector_type: LocalCartesian\nvertical_datum: WGS84\nmap_origin:\n"

@@ -37,6 +37,7 @@ class FinishedRun:
     """The content of a run folder."""
 
     folder: Path
+    log: RunLog
     dataset: str
     config: Config
     result: SlamResult
@@ -92,6 +93,7 @@ def read_run(folder: str | Path) -> FinishedRun:
         raise SegslamError(f"{log.path}: damaged, {left}; replay it, or map the data again")
     return FinishedRun(
         folder=folder,
+        log=log,
         dataset=log.run.get("dataset", ""),
         config=log.config,
         result=replace(result, alone=read_alone(folder, result.odometry)),

@@ -24,7 +24,7 @@ from segslam.core.types import (
     Vector,
     WorkFailed,
 )
-from segslam.core.whole_files import whole_file, write_whole
+from segslam.core.whole_files import unless_damaged, whole_file, write_whole
 
 POSE_COLUMNS = tuple(f"T{row}{column}" for row in range(4) for column in range(4))
 LOOP_COLUMNS = (
@@ -142,11 +142,8 @@ def read_localised(folder: Path, num_scans: int) -> Vector | None:
     file = folder / "localised.csv"
     if not file.exists():
         return None
-    try:
-        with file.open(newline="", encoding="utf-8") as stream:
-            distance_m = np.array([float(row["from_placed_keyframe_m"] or "inf") for row in csv.DictReader(stream)])
-    except (KeyError, ValueError, TypeError) as error:
-        raise SegslamError(f"{file}: damaged ({error!r}); localise the data again") from error
+    with unless_damaged(file, "localise the data again"), file.open(newline="", encoding="utf-8") as stream:
+        distance_m = np.array([float(row["from_placed_keyframe_m"] or "inf") for row in csv.DictReader(stream)])
     if len(distance_m) != num_scans:
         raise SegslamError(f"{file}: damaged, {len(distance_m)} rows for {num_scans} scans; localise the data again")
     return distance_m

@@ -77,13 +77,6 @@ def _check_packages(file: Path, needs: str, packages: Sequence[str], *, extra: s
         raise SegslamError(f"{file}: {needs} extra packages: {how_to_install(extra)}; {others}")
 
 
-def check_files(files: Sequence[Path], *, origin: "Origin | None" = None, others: Iterable[str] = ()) -> None:
-    """Raises SegslamError as `check_names`, and for a file that cannot be written."""
-    check_names(files, origin=origin, others=others)
-    for file in files:
-        check_target(file)
-
-
 def write_map(
     placed: Iterable[tuple[Keyframe, Transform]],
     files: Sequence[Path],
@@ -100,7 +93,9 @@ def write_map(
     .las and .laz are in UTM. Files are written atomically. `show` passes the parts on, to show progress. Raises
     SegslamError for another extension, a missing folder, or if no keyframe has a point, OSError if the disk is full.
     """
-    check_files(files, origin=origin)
+    check_names(files, origin=origin)
+    for file in files:
+        check_target(file)
     with temporary_folder(files[0].parent, ".map-") as scratch:
         store = MapStore(scratch, config, origin)
         for keyframe, T_world_keyframe in placed:

@@ -11,7 +11,6 @@ from segslam.core.processes import in_parts
 from segslam.core.whole_files import expanded, write_whole
 from segslam.output.finished import FinishedRun, read_run
 from segslam.output.folder import folder_of
-from segslam.output.log import read_log
 from segslam.output.map.before_after import BeforeAfter
 from segslam.output.map.from_above import small_png
 from segslam.output.report import figures, loops
@@ -33,11 +32,10 @@ def write_report(folder: str | Path) -> Path:
     """
     folder = folder_of(expanded(folder))
     run = read_run(folder)
-    log = read_log(folder)
     drawings: list[Callable[[FinishedRun], Any]] = [_plots, _pictures]
     loops.packed_plotly()  # kept here, not in the copy that writes it: other reports may follow
     plots, (top, gallery) = in_parts(drawings, lambda part: [draw(run) for draw in part])
-    about = {**log.run, "segslam": log.packages.get("segslam", "unknown version")}
+    about = {**run.log.run, "segslam": run.log.packages.get("segslam", "unknown version")}
     file = folder / "report.html"
     html = page(run, plots, top=top, gallery=gallery, about=about)
     write_whole(file, html.encode(errors="backslashreplace"))
@@ -79,7 +77,7 @@ def _pictures(run: FinishedRun) -> tuple[str, str]:
 
 
 def _before_after(run: FinishedRun) -> BeforeAfter:
-    _, cloud_of = read_log(run.folder).keyframes()
+    _, cloud_of = run.log.keyframes()
     poses = run.result.odometry.T_world_lidar[run.result.keyframe_rows]
     drawn = range(0, len(poses), 1 + len(poses) // MOST_KEYFRAMES)
     return BeforeAfter(dict(enumerate(poses)), run.result.estimate, drawn, cloud_of)

@@ -176,7 +176,7 @@ def join(
             merged = arranged(sessions, poses, same_reference=same_reference)
             config = sessions[0].run.config
             parts = [
-                part_of(drive.name, drive.key, one.T_world_keyframe, one.log.adjustment(), config=config.refine)
+                part_of(drive.name, drive.key, one.T_world_keyframe, one.run.log.adjustment(), config=config.refine)
                 for drive, one in zip(drives, sessions, strict=True)
             ]
             kept = Alignments(fleet / ALIGNMENTS, parts)
@@ -186,9 +186,7 @@ def join(
             write_merged(merged, part, config, kept=kept, before=log)
             for file, alignments in kept.changed():
                 _replace(file, partial(write_kept, kind=tuple[KeptAlignment, ...], value=alignments))
-        made = read_log(part).result()
-        assert made is not None
-        _write_drives(part / "drives", drives, sessions, made[1])
+        _write_drives(part / "drives", drives, sessions, read_log(part).final()[1])
         _made(part, folder, key)
     return read_metrics(folder)
 

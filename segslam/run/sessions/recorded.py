@@ -24,7 +24,6 @@ from segslam.core.types import (
 )
 from segslam.output.finished import FinishedRun, Part, read_corrections, read_run
 from segslam.output.folder import log_of
-from segslam.output.log import RunLog, read_log
 from segslam.slam.adjustment.alignment import MIN_PAIRS
 from segslam.slam.adjustment.known import Kept, Known, nothing_kept
 from segslam.slam.adjustment.sweeps import common_sweep
@@ -64,7 +63,6 @@ class Session:
     """A finished run with the poses of its keyframes."""
 
     run: FinishedRun
-    log: RunLog
     keyframes: list[Keyframe]
     """Without points."""
     cloud_of: CloudOf
@@ -85,8 +83,8 @@ class Session:
 def known_of(sessions: Sequence[Session], kept: Kept = nothing_kept) -> Known:
     """The results of the sessions' own adjustments, for all of them together."""
     poses = np.concatenate([session.T_world_keyframe for session in sessions])
-    corrections = [one for each in sessions for one in read_corrections(each.log, each.run.result)]
-    adjustments = [session.log.adjustment() for session in sessions]
+    corrections = [one for each in sessions for one in read_corrections(each.run.log, each.run.result)]
+    adjustments = [session.run.log.adjustment() for session in sessions]
     sweeps = [None if one is None else one.sweep for one in adjustments]
     return Known(poses, corrections, _angle(sessions), common_sweep(sweeps), kept)
 
@@ -103,13 +101,13 @@ def _angle(sessions: Sequence[Session]) -> VerticalAngle | None:
 
 def read_session(folder: Path) -> Session:
     """The session of a run folder, or of its log. Raises SegslamError as `read_run`, or if keyframes are missing."""
-    run, log = read_run(folder), read_log(folder)
-    (keyframes, cloud_of), estimate = log.keyframes(), run.result.estimate.T_world_keyframe
+    run = read_run(folder)
+    (keyframes, cloud_of), estimate = run.log.keyframes(), run.result.estimate.T_world_keyframe
     ids = range(len(keyframes))
     if list(estimate) != list(ids):
-        raise SegslamError(f"{log.path}: damaged, poses of {len(estimate)} keyframes for {len(ids)}; replay it")
+        raise SegslamError(f"{run.log.path}: damaged, poses of {len(estimate)} keyframes for {len(ids)}; replay it")
     travel_m = np.array([keyframe.travel_m for keyframe in keyframes])
-    return Session(run, log, keyframes, cloud_of, np.array([estimate[number] for number in ids]), travel_m)
+    return Session(run, keyframes, cloud_of, np.array([estimate[number] for number in ids]), travel_m)
 
 
 def read_sessions(folders: list[Path]) -> list[Session]:
@@ -131,7 +129,7 @@ def shifted(closure: LoopClosure, source_shift: int, target_shift: int) -> LoopC
 def shifted_steps(session: Session, more: Mapping[int, LoopAttempt]) -> Iterator[Step]:
     """The steps of a session (`RunLog.whole_steps`) by its shift; `more`: a loop of its keyframes, by original id."""
     shift = session.shift
-    for number, step in enumerate(session.log.whole_steps(len(session.travel_m))):
+    for number, step in enumerate(session.run.log.whole_steps(len(session.travel_m))):
         attempts, keyframe = [_shifted(attempt, shift.keyframe_id) for attempt in step.attempts], step.keyframe
         if keyframe is not None:
             attempts += [more[keyframe.id]] if keyframe.id in more else []

@@ -89,7 +89,7 @@ def sweep(
     grid = grid_of(settings)
     check_own(out, SOURCE, "*=*")
     terminal.announce(f"sweep: reading {run}")
-    from segslam.output.folder import log_of, not_writable
+    from segslam.output.folder import log_of, writable
     from segslam.output.log import read_log
     from segslam.run.fleets.workers import workers as started
     from segslam.run.replay import changed_config
@@ -97,10 +97,8 @@ def sweep(
     recorded = read_log(run)
     for changes in grid.values():  # reports a wrong setting before anything is replayed
         changed_config(recorded, settings=changes)
-    try:
+    with writable(out):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise not_writable(out, error) from error
     check_free([tables.csv, tables.latex], overwrite=overwrite)  # which may be in this folder
     log, note = log_of(run), out / SOURCE
     source = f"{log.resolve()} of {log.stat().st_mtime_ns} ns\n"

@@ -167,10 +167,9 @@ def _follow(
             if scene:
                 scene.add(step)
             if isinstance(step, Step):
-                keyframe = step.keyframe
                 if publisher:
-                    publisher.note_step(step.stamp_ns, keyframe.T_odom_keyframe if keyframe else None, step.estimate)
-                if keyframe:
+                    publisher.note_step(step)
+                if step.keyframe:
                     is_corrected = step.estimate is not None
                     live_map.note(*run.map_so_far(), stamp_ns=step.stamp_ns, is_corrected=is_corrected)
             figures.note(placed, lag_s=monotonic() - placed.placed_s, tries_loops=tries_loops)

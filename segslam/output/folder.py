@@ -57,27 +57,27 @@ def folder_of(run: Path) -> Path:
 def new_folder(folder: Path) -> Path:
     """Create an empty folder for a run. Raises SegslamError if it is not empty, so that no results are overwritten."""
     check_new(folder)
-    try:
+    with writable(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise not_writable(folder, error) from error
     return folder
 
 
 def check_new(folder: Path) -> None:
     """Raises SegslamError if the new folder of a run is not empty."""
-    try:
+    with writable(folder):
         if folder.exists() and any(folder.iterdir()):
             resume = "continue an interrupted run: segslam resume, or replace a run"
             more = resume if (folder / LOG).exists() else "or replace results of this command"
             raise SegslamError(f"{folder}: not empty; give another folder with --out, {more}: --overwrite")
+
+
+@contextmanager
+def writable(folder: Path) -> Iterator[None]:
+    """Context manager that raises SegslamError if a new folder cannot be read or written within it."""
+    try:
+        yield
     except OSError as error:
-        raise not_writable(folder, error) from error
-
-
-def not_writable(folder: Path, error: OSError) -> SegslamError:
-    """The exception for a new folder that cannot be written."""
-    return SegslamError(f"{folder}: cannot be written ({error.strerror}); give another with --out")
+        raise SegslamError(f"{folder}: cannot be written ({error.strerror}); give another with --out") from error
 
 
 def write_poses(

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib import colormaps
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from segslam.core.trajectory import parted
@@ -133,8 +134,6 @@ def shaded(image: np.ndarray, height_m: np.ndarray, window: int) -> np.ndarray:
 
 def of_numbers(values: Vector, *, span: tuple[float, float]) -> Colors:
     """Colours (n, 3) from dark violet, at the start of the span and below, to yellow, at its end and above."""
-    from matplotlib import colormaps
-
     low, high = span
     table = (255 * colormaps["viridis"](np.linspace(0.0, 1.0, 256))[:, :3]).astype(np.uint8)
     share = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0)

@@ -16,7 +16,7 @@ from segslam.core.threads import Stopwatch
 from segslam.core.types import SegslamError, WorkFailed
 from segslam.core.whole_files import expanded, write_whole
 from segslam.graph.confirmation import MIN_CONSISTENT
-from segslam.output.folder import not_writable
+from segslam.output.folder import writable
 from segslam.run.fleets import steps
 from segslam.run.fleets.drives import Drive, drives_of, read_drives
 from segslam.run.fleets.relations import Components
@@ -97,7 +97,7 @@ def fleet(
 def _alone_in(folder: Path) -> Iterator[None]:
     """Context manager that locks a fleet's folder, if the file system can, and removes what interrupted steps left."""
     with ExitStack() as stack:
-        try:
+        with writable(folder):
             folder.mkdir(parents=True, exist_ok=True)
             lock = os.open(folder, os.O_RDONLY)
             stack.callback(os.close, lock)
@@ -108,8 +108,6 @@ def _alone_in(folder: Path) -> Iterator[None]:
             except OSError as error:  # such as NFS, which does not lock folders
                 logger.info("%s: not locked (%s)", folder, error.strerror)
             steps.remove_unfinished(folder)
-        except OSError as error:
-            raise not_writable(folder, error) from error
         try:
             yield
         finally:

@@ -20,7 +20,7 @@ from segslam.core.config import Config, load_config
 from segslam.core.types import SegslamError, Trajectory
 from segslam.gnss.reading import read_fixes
 from segslam.output.finished import read_metrics
-from segslam.output.folder import log_of, write_poses
+from segslam.output.folder import UNFINISHED, log_of, write_poses
 from segslam.output.georeferenced import georeference_if_possible
 from segslam.output.log import read_log
 from segslam.run.fleets.drives import Drive, key_of
@@ -36,7 +36,6 @@ from segslam.scans.presets import SETTINGS, Preset, extent_m, preset, preset_for
 RUNS, INDEX, PROPOSALS, PAIRS, ALIGNMENTS = "runs", "index", "proposals", "pairs", "alignments"
 KEY = "fleet.key"
 """File in a run folder of a fleet: the key that it was made with."""
-UNFINISHED = ".part"
 MOST_LIKELY = 12
 """Chosen: largest number of keyframes that are searched in another drive, those that look most like a place there."""
 NUM_SESSIONS = 4

@@ -28,7 +28,7 @@ from std_msgs.msg import Header
 
 from segslam.core import geometry
 from segslam.core.errors import brief
-from segslam.core.types import BadScan, GraphEstimate, Labels, Points, Scan, SegslamError, Transform
+from segslam.core.types import BadScan, Labels, Points, Scan, SegslamError, Step, Transform
 from segslam.gnss.fixes import Row
 from segslam.gnss.reading import row_of
 from segslam.run.live.live_map import DrawnMap
@@ -214,14 +214,15 @@ class MappingPublisher(_Spun):
         self._transforms = self._node.create_publisher(TFMessage, "/tf", 100) if TFMessage else None
         self._T_map_odom = np.eye(4)
 
-    def note_step(self, stamp_ns: int, T_odom_keyframe: Transform | None, estimate: GraphEstimate | None) -> None:
+    def note_step(self, step: Step) -> None:
         """Publish `map -> odom` after an optimisation, and on /tf at every step."""
-        if estimate is not None and T_odom_keyframe is not None:
+        estimate, keyframe = step.estimate, step.keyframe
+        if estimate is not None and keyframe is not None:
             last = max(estimate.T_world_keyframe)
-            self._T_map_odom = estimate.T_world_keyframe[last] @ geometry.inverse(T_odom_keyframe)
+            self._T_map_odom = estimate.T_world_keyframe[last] @ geometry.inverse(keyframe.T_odom_keyframe)
         if estimate is None and self._transforms is None:
             return
-        transform = _transform(self._T_map_odom, parent=MAP, child=ODOM, stamp_ns=stamp_ns)
+        transform = _transform(self._T_map_odom, parent=MAP, child=ODOM, stamp_ns=step.stamp_ns)
         if estimate is not None:
             self._correction.publish(transform)
         if self._transforms:

@@ -285,8 +285,7 @@ def _experiment(
     kept = f"are kept in {options.out}; the same command continues" if options.out else "are lost; --out keeps them"
     when_stopped(f"the finished registrations {kept}")
     before = rows_before(options.out, job, trials) if options.out else []
-    num_workers, scheduler = options.workers, options.scheduler
-    work = run(job, trials, workers=num_workers, scheduler=scheduler, folder=options.out, before=before)
+    work = run(job, trials, workers=options.workers, scheduler=options.scheduler, folder=options.out, before=before)
     num_before = len({row.trial_key for row in before})
     shown = terminal.progress(work, len(trials), "bench", num_before=num_before)
     if is_interrupted(map(rows.extend, shown)):

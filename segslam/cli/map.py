@@ -4,6 +4,7 @@ import json as json_text
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -210,13 +211,10 @@ def _in_map(in_map: Path | None) -> "tuple[SlamOf | None, Callable[[Path], str] 
     """What makes pipelines that localise in the map of a run, and what gives its place on the globe to a run."""
     if in_map is None:
         return None, None
-    from segslam.output.georeferenced import GEODETIC, take_over
+    from segslam.output.georeferenced import take_over
     from segslam.run.sessions.localiser import localiser_in
 
-    def place(folder: Path) -> str:
-        return f"place on the globe: that of the map, see {GEODETIC}" if take_over(folder, in_map) else ""
-
-    return localiser_in(in_map), place
+    return localiser_in(in_map), partial(take_over, map_run=in_map)
 
 
 def _show_complete(

@@ -94,7 +94,7 @@ def fleet(
         check_exists(path, "give a list of drives in YAML, or recordings")
     check_own(out, "runs")
     terminal.announce("fleet: reading the list")
-    from segslam.run.fleets.drives import drives_of, read_drives
+    from segslam.run.fleets.drives import drives_of
     from segslam.run.fleets.orchestrate import FILE
     from segslam.run.fleets.orchestrate import fleet as run_fleet
 
@@ -102,15 +102,11 @@ def fleet(
     lists = [path for path in drives if path.suffix.lower() in (".yaml", ".yml")]
     if lists and len(drives) > 1:
         raise SegslamError(f"{lists[0]}: a list of drives; give it alone, with all drives in it")
-    if lists:
-        if changes.config is not None:
-            raise SegslamError("--config: give it for each drive in the list, as config: FILE.yaml")
-        listed = read_drives(drives[0])
-    else:
-        listed = drives_of(drives, config=changes.config)
+    if lists and changes.config is not None:
+        raise SegslamError("--config: give it for each drive in the list, as config: FILE.yaml")
     when_stopped(f"what is done is kept in {out}; call the same command again to go on")
     result = run_fleet(
-        listed,
+        lists[0] if lists else drives_of(drives, config=changes.config),
         out,
         scheduler=scheduler,
         num_workers=workers,

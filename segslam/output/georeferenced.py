@@ -109,20 +109,20 @@ def georeference_if_possible(
         return ""
 
 
-def take_over(run: str | Path, map_run: str | Path) -> bool:
-    """Place a run that was localised in the map of a georeferenced run on the globe.
+def take_over(run: str | Path, map_run: str | Path) -> str:
+    """Place a run that was localised in the map of a georeferenced run on the globe; returns what was done.
 
-    False if that has no place, or no scan was localised.
+    Empty if that has no place, or no scan was localised.
 
     Each scan keeps its pose relative to the nearest keyframe of the map, so that it moves as the map was bent.
     """
     source = folder_of(expanded(map_run))
     globe = read_globe(source)
     if globe is None:
-        return False
+        return ""
     made, mapped = read_run(run), read_run(source).result
     if not made.result.localised().any():
-        return False
+        return ""
     T_world_keyframe = mapped.trajectory.T_world_lidar[mapped.keyframe_rows]
     T_enu_map = globe.T_enu_lidar[mapped.keyframe_rows] @ np.linalg.inv(T_world_keyframe)
     poses = made.result.trajectory.T_world_lidar
@@ -137,7 +137,7 @@ def take_over(run: str | Path, map_run: str | Path) -> bool:
         shown = Locations(schema.LIDAR, stamp_ns, places[is_localised], sigma_m)
         write_locations(log_of(made.folder), {schema.POSITIONS: shown})
         write_whole(made.folder / FILE, json.dumps(values, indent=2) + "\n")
-    return True
+    return f"place on the globe: that of the map, see {GEODETIC}"
 
 
 def recorded_fixes(folder: Path, *, stamp_shift_ns: int = 0) -> tuple[list[Row], str]:

@@ -71,9 +71,7 @@ class Replay:
 
     def begun(self, folder: Path, slam: Slam | None = None, *, mirror: Mirror | None = None) -> Run:
         """The new run in its folder, before its first step. By default, `slam` closes loops with the edits."""
-        options = {"in_map": str(self.in_map)} if self.in_map else {}
-        if sessions := self.recorded.options.get("sessions"):
-            options["sessions"] = sessions
+        options = {name: text for name in ("in_map", "sessions") if (text := self.recorded.options.get(name))}
         if self.edits != NO_EDITS:
             options["edits"] = self.edits.to_json()
         return Run(

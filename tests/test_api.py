@@ -230,6 +230,7 @@ WRONG_KINDS = {
     "segslam.Scan(np.ones((5, 3)), 0, labels=np.ones(2, np.uint8))": "2 labels for 5 points",
     "segslam.Scan(np.ones((5, 3)), 0, labels=['road'] * 5)": "labels: not an array of numbers",
     "segslam.Scan(np.ones((2, 3)), 0, labels=[9, 65545])": "labels: 65545 is not a learning id",
+    "segslam.register(np.ones((2, 3)), np.ones((2, 3)), source_labels=[9, 40])": "labels: 40 is not a learning id",
     "segslam.Scan(np.ones((5, 3)), 0, intensities=np.ones(3))": "intensities: 3 for 5 points",
     "segslam.Scan(np.ones((2, 3)), 0, intensities=['a', 'b'])": "intensities: 2 for 2 points; give one number for each",
     "segslam.evaluate(np.eye(4)[None], np.eye(4)[None], align='Sim3')": "align='Sim3': unknown; known: se3",

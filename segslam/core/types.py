@@ -89,7 +89,7 @@ def as_points(points: ArrayLike) -> Points:
 
 
 def as_labels(labels: ArrayLike | None, points: Points) -> Labels | None:
-    """Learning ids as an array; None without labels. Raises SegslamError unless they are one for each point."""
+    """Learning ids as an array; None without labels. Raises SegslamError unless they are one `Label` for each point."""
     if labels is None:
         return None
     try:
@@ -100,8 +100,9 @@ def as_labels(labels: ArrayLike | None, points: Points) -> Labels | None:
         raise SegslamError(f"labels: not an array of numbers ({error}); give one for each point") from error
     if array.shape != (len(points),):
         raise SegslamError(f"labels: {array.size} labels for {len(points)} points; give one for each")
-    if not np.array_equal(array, ids):
-        raise SegslamError(f"labels: {array[array != ids][0]} is not a learning id; give integers from 0 to 255")
+    wrong = array[(array != ids) | (ids >= len(Label))]
+    if len(wrong):
+        raise SegslamError(f"labels: {wrong[0]} is not a learning id; give integers from 0 to {len(Label) - 1}")
     return ids
 
 

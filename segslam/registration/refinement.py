@@ -204,9 +204,9 @@ def refine(
     to plane. Rejects TOO_FEW_POINTS, and REFINEMENT_DIVERGED if no pairs remain or, with `must_converge`, if the last
     stage does not converge and as many iterations again move the pose by more than `SETTLED_M` or `SETTLED_RAD`.
     """
-    if min(len(source), len(target)) < MIN_POINTS:
-        sizes = f"{len(source)} and {len(target)} points, {MIN_POINTS} needed"
-        return Rejected(RejectReason.TOO_FEW_POINTS, sizes)
+    rejected = too_few_points(source, target)
+    if rejected is not None:
+        return rejected
     for correspondence_m in config.correspondence_m:
         result = _aligned(source, target, T_target_source, correspondence_m, MAX_ITERATIONS, precision_m)
         T_target_source = result.T_target_source
@@ -228,6 +228,14 @@ def refine(
         rms_m=float(np.sqrt(np.mean(paired**2))),
         information=limited_information((result.H + result.H.T) / 2 * INFORMATION_SCALE, config=config),
     )
+
+
+def too_few_points(source: Surface, target: Surface) -> Rejected | None:
+    """TOO_FEW_POINTS for two surfaces that cannot be registered; None for all others."""
+    if min(len(source), len(target)) >= MIN_POINTS:
+        return None
+    sizes = f"{len(source)} and {len(target)} points within {MAX_RANGE_M:g} m, {MIN_POINTS} needed"
+    return Rejected(RejectReason.TOO_FEW_POINTS, sizes)
 
 
 def is_near(T_target_source: Transform, T_target_others: Sequence[Transform]) -> bool:

@@ -77,6 +77,9 @@ def tried_poses(trial: Trial) -> list[Found] | Rejected:
 
     Rivals are searched unless the best pose is improbable already.
     """
+    unusable = refinement.too_few_points(trial.source.surface, trial.target.surface)
+    if unusable is not None:
+        return unusable
     rejections: list[Rejected] = []
     found: list[Found] = []
     for coarse in trial.coarse_poses():

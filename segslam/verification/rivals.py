@@ -65,8 +65,6 @@ def _starts(found: Found, trial: Trial) -> list[_Start]:
 def _led(coarse: Registration, found: Found, trial: Trial) -> _Start | None:
     """Where few points lead; None if the pose is hopeless, mostly after the first iterations."""
     surfaces = few_points(trial.source), trial.target.surface
-    if min(map(len, surfaces)) < refinement.MIN_POINTS:
-        return None
     with trial.watch("refine"):
         T_begun = refinement.approach(*surfaces, coarse.T_target_source, config=trial.config.refine)
     if refinement.is_near(T_begun, [found.T_target_source]):

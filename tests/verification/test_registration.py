@@ -255,6 +255,15 @@ def test_scans_without_usable_points_are_rejected(points: np.ndarray) -> None:
     assert isinstance(register(points, points), Rejected)
 
 
+@pytest.mark.parametrize(("shift_m", "scale"), [(1e6, 1.0), (0.0, 1000.0), (0.0, 0.0)])
+def test_coordinates_of_a_map_or_in_millimetres_are_too_few_points(shift_m: float, scale: float) -> None:
+    scans, _ = round_drive()
+    outcome = register(scale * scans[0].points + [shift_m, 0.0, 0.0], scans[1].points)
+    assert isinstance(outcome, Rejected)
+    assert outcome.reason is RejectReason.TOO_FEW_POINTS
+    assert "points within 60 m, 100 needed" in outcome.detail
+
+
 @pytest.mark.parametrize("is_better", [True, False])
 def test_a_rival_that_does_not_converge_where_it_is_rivals_but_is_not_returned(
     is_better: bool, monkeypatch: pytest.MonkeyPatch

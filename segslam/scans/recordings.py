@@ -108,8 +108,7 @@ class Recording(Dataset):
         index = int(self.scan_index[row])
         file = self._file(index)
         try:
-            with contextlib.redirect_stdout(io.StringIO()):
-                item = read_file(file) if self._kind in READ_HERE else self._loader[index]
+            item = read_file(file) if self._kind in READ_HERE else self._loader[index]
             if not isinstance(item, Cloud):
                 item = Cloud(*item) if isinstance(item, tuple) else Cloud(item)
                 if self._has_intensities or self.labels.network:

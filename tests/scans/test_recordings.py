@@ -1,6 +1,8 @@
 """Everything that kiss_icp reads, as scans, and its ways of failing, as errors."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Barrier
 
 import numpy as np
 import open3d as o3d
@@ -11,6 +13,7 @@ from segslam.core import geometry
 from segslam.core.pose_files import write_kitti
 from segslam.core.types import BadScan, Label, SegslamError
 from segslam.scans import open_dataset
+from segslam.scans.clouds import read_file
 from segslam.scans.dataset import Cloud
 from segslam.scans.messages import InOrder
 
@@ -35,6 +38,28 @@ def test_folder_of_clouds_is_detected(tmp_path: Path, capsys: pytest.CaptureFixt
     assert dataset.labels.geometric
     assert dataset[0].points.dtype == np.float32
     assert capsys.readouterr().out == ""  # kiss_icp prints, standard output is ours
+
+
+def test_scans_can_be_read_in_two_threads_while_a_program_prints(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Replacing standard output while a scan is read loses all that follows: the thread that ends last restores it."""
+    dataset = open_dataset(_write_clouds(tmp_path / "drive", 2))
+    both = Barrier(2, timeout=20.0)
+
+    def read(file: Path) -> Cloud:
+        both.wait()
+        print("reading")
+        if file.stem == "cloud_1":
+            first_read.result()
+        return read_file(file)
+
+    monkeypatch.setattr("segslam.scans.recordings.read_file", read)
+    with ThreadPoolExecutor(2) as threads:
+        first_read = threads.submit(dataset.__getitem__, 0)
+        assert len(threads.submit(dataset.__getitem__, 1).result().points) == 4
+    print("after")
+    assert capsys.readouterr().out.split() == ["reading", "reading", "after"]
 
 
 def test_times_poses_and_labels_beside_velodyne_belong_to_its_clouds(tmp_path: Path) -> None:

@@ -51,6 +51,16 @@ def test_points_that_are_no_return_stay_unlabelled(tmp_path: Path) -> None:
     assert Network(made_network(tmp_path)).labels(points[:0], np.zeros(0)).shape == (0,)
 
 
+@pytest.mark.parametrize("ids", [False, True])
+def test_intensities_that_are_no_number_are_zeros(tmp_path: Path, ids: bool) -> None:
+    points, intensities = one_point_a_pixel()
+    broken, zeros = intensities.copy(), intensities.copy()
+    broken[[3, 50, 700]] = np.nan, np.inf, -np.inf
+    zeros[[3, 50, 700]] = 0.0
+    network = Network(made_network(tmp_path, ids=ids))
+    np.testing.assert_array_equal(network.labels(points, broken), network.labels(points, zeros))
+
+
 def test_sizes_that_the_model_leaves_open_fit_any_settings(tmp_path: Path) -> None:
     points, intensities = one_point_a_pixel()
     fixed, free = tmp_path / "fixed", tmp_path / "free"

@@ -49,7 +49,8 @@ class FreeSpace:
 
     def __init__(self, points: Points) -> None:
         """`points` (n, 3) are in the sensor's frame."""
-        rays = np.ascontiguousarray(points, np.float32)
+        with np.errstate(over="ignore"):  # infinite: no return
+            rays = np.ascontiguousarray(points, np.float32)
         range_m, elevation_rad, column = _spherical(rays.compress(within_range(rays, 0.0, np.inf), axis=0))
         self.lowest_rad = float(elevation_rad.min()) if len(range_m) else 0.0
         """Lower edge of the first row."""

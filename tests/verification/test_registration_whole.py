@@ -81,8 +81,8 @@ def test_scans_of_a_single_class_are_registered_or_rejected(label: Label) -> Non
 def test_points_of_no_number_change_nothing() -> None:
     scans, _ = round_drive()
     points, labels = scans[3].points, scans[3].labels
-    broken = np.concatenate([points, np.full((100, 3), np.nan), np.full((1, 3), np.inf)])
-    labelled = np.concatenate([labels, np.full(101, Label.CAR, np.uint8)])
+    broken = np.concatenate([points, np.full((100, 3), np.nan), np.full((1, 3), np.inf), np.full((1, 3), 1e300)])
+    labelled = np.concatenate([labels, np.full(102, Label.CAR, np.uint8)])
     target = {"target_points": scans[0].points, "target_labels": scans[0].labels}
     whole = register(points, source_labels=labels, **target)
     found = register(broken, source_labels=labelled, **target)

@@ -114,8 +114,8 @@ def signature_of_standing(points: Points) -> PlaceSignature:
 
 def _image(points: Points) -> Float[np.ndarray, "size size"]:
     """Square roots of the occupied voxels of each column, weighted by the distance from the sensor."""
-    cells = np.rint(points / CELL_M).astype(np.int64)
-    cells = cells[(np.abs(cells[:, :2]) <= HALF).all(axis=1)]
+    cells = np.rint(points / CELL_M)
+    cells = cells[(np.abs(cells) <= [HALF, HALF, 2**15 - 1]).all(axis=1)].astype(np.int64)  # false for NaN
     width = 2 * HALF + 1
     voxels = ((cells[:, 0] + HALF) * width + cells[:, 1] + HALF) * 2**16 + cells[:, 2] + 2**15
     occupied = voxels[first_rows(voxels) == np.arange(len(voxels))]

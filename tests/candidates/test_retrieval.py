@@ -95,6 +95,13 @@ def test_points_outside_the_image_do_not_change_a_signature() -> None:
     assert whole.to_bytes() == cut.to_bytes()
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e20, 1e300])
+def test_points_of_no_number_do_not_change_a_signature(value: float) -> None:
+    expected = signature_of_standing(street(3)).spectrum
+    for point in np.where(np.eye(3, dtype=bool), value, 1.0):
+        np.testing.assert_array_equal(signature_of_standing(np.vstack([street(3), point])).spectrum, expected)
+
+
 def test_scans_without_points_have_a_signature() -> None:
     empty = np.empty((0, 3), np.float32)
     signature = signature_of(empty, np.empty(0, np.uint8))

@@ -57,8 +57,8 @@ class Network:
     def labels(self, points: Points, intensities: Vector) -> Labels:
         """The label (n,) of each point (n, 3) of a scan in the LiDAR frame, in the order of its file.
 
-        UNLABELLED for points that are not finite or at the origin; zeros replace intensities that are not finite. Raises
-        SegslamError for class ids beyond the classes of the settings, and for outputs that are not finite.
+        UNLABELLED for points that are not finite or at the origin. Zeros replace intensities that are not finite.
+        Raises SegslamError for class ids beyond the classes of the settings, and for outputs that are not finite.
         """
         labels = np.full(len(points), Label.UNLABELLED, np.uint8)
         usable = within_range(points, 0.0, np.inf)

@@ -90,20 +90,27 @@ def as_points(points: ArrayLike) -> Points:
 
 def as_labels(labels: ArrayLike | None, points: Points) -> Labels | None:
     """Learning ids as an array; None without labels. Raises SegslamError unless they are one `Label` for each point."""
-    if labels is None:
-        return None
+    return None if labels is None else _ids(labels, len(points))
+
+
+def _ids(labels: ArrayLike, num_points: int) -> Labels:
     try:
         array = np.asarray(labels)
         with np.errstate(invalid="ignore"):
             ids = array.astype(np.uint8, copy=False)
     except (TypeError, ValueError) as error:
         raise SegslamError(f"labels: not an array of numbers ({error}); give one for each point") from error
-    if array.shape != (len(points),):
-        raise SegslamError(f"labels: {array.size} labels for {len(points)} points; give one for each")
+    if array.shape != (num_points,):
+        raise SegslamError(f"labels: {array.size} labels for {num_points} points; give one for each")
     wrong = array[(array != ids) | (ids >= len(Label))]
     if len(wrong):
         raise SegslamError(f"labels: {wrong[0]} is not a learning id; give integers from 0 to {len(Label) - 1}")
     return ids
+
+
+def _returned(function: Callable[[], ArrayLike], num_points: int) -> Labels:
+    """The labels that a function returns, checked like others."""
+    return _ids(function(), num_points)
 
 
 class Label(IntEnum):
@@ -206,7 +213,7 @@ class Scan(Record):
             raise SegslamError(f"stamp_ns {stamp_ns!r}: give integer nanoseconds")
         if not isinstance(index, int | np.integer | None):
             raise SegslamError(f"index {index!r}: give an integer, or None")
-        labels = labels if callable(labels) else as_labels(labels, xyz)
+        labels = partial(_returned, labels, len(xyz)) if callable(labels) else as_labels(labels, xyz)
         labels = np.zeros(len(xyz), np.uint8) if labels is None else labels
         times = np.empty(0) if times is None else np.asarray(times)
         if times.shape not in ((0,), (len(xyz),)):

@@ -13,6 +13,7 @@ from scipy.linalg import eigh
 
 from segslam.core import geometry
 from segslam.core.types import Information, Points, Transform, Vector
+from segslam.odometry.nudge import NUM_POINTS
 from segslam.registration.refinement import LightSurface
 
 OUTLIER_SHARE = 0.1
@@ -67,9 +68,10 @@ def fit(
 ) -> Fit:
     """Fit of downsampled points (n, 3) to a surface with one point in each voxel, at a pose.
 
-    `sigma_m`: roughness of the surface, if known; at least `LEAST_SIGMA_VOXELS` is used.
+    `NUM_POINTS` of the points are sufficient for the means; all count as observations. `sigma_m`: roughness of the
+    surface, if known; at least `LEAST_SIGMA_VOXELS` is used.
     """
-    source = points.astype(np.float64)
+    source = points[:: max(1, len(points) // NUM_POINTS)].astype(np.float64)
     reach_m, sigma_m = REACH_VOXELS * voxel_m, max(sigma_m, LEAST_SIGMA_VOXELS * voxel_m)
     moved = geometry.apply(T_target_source, source)
     rows, apart_m = target.nearest(moved)
@@ -79,7 +81,7 @@ def fit(
     inlier = (1.0 - OUTLIER_SHARE) / (math.sqrt(2.0 * math.pi) * sigma_m) * np.exp(-0.5 * (to_plane / sigma_m) ** 2)
     outlier = OUTLIER_SHARE / (2.0 * reach_m)
     total_log = float(np.log(inlier + outlier).sum()) + (len(source) - len(near)) * math.log(outlier)
-    cells = np.floor(source / (PATCH_VOXELS * voxel_m)).astype(np.int64)
+    cells = np.floor(points / (PATCH_VOXELS * voxel_m)).astype(np.int64)
     num_patches = len(np.unique(cells @ np.array([1, 1 << 20, 1 << 40])))
     weights = inlier / (inlier + outlier) * (num_patches / max(len(source), 1) / sigma_m**2)
     return Fit(

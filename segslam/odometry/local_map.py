@@ -8,8 +8,8 @@ import numpy as np
 
 from segslam.core import geometry
 from segslam.core.config import RefineConfig
-from segslam.core.points import voxel_first, voxel_means
-from segslam.core.types import Points, Registration, Transform
+from segslam.core.points import voxel_first, within_range
+from segslam.core.types import Indices, Points, Registration, Transform
 from segslam.odometry.likelihood import Fit, fit
 from segslam.odometry.nudge import NUM_POINTS, NUM_SEARCH, POLISH_VOXELS, SEARCH_VOXELS, nudge
 from segslam.registration import refinement
@@ -24,6 +24,9 @@ SPACING_VOXELS = 0.4
 """Chosen: a scan nearer than this to the last one in the map (`geometry.displacement_m`) adds nothing to it."""
 SEARCH_VOXELS_GICP = (4.0, 1.4)
 """Chosen: search distances of GICP, in voxels."""
+
+MOST_CELLS = 1 << 20
+"""Number of voxels from the start of the drive to where their keys are no longer distinct: 500 km."""
 
 
 class SeenScan:
@@ -83,6 +86,7 @@ class LocalMap:
         self._config = config.model_copy(update={"correspondence_m": reaches_m})
         self._scans: deque[tuple[Transform, Points]] = deque(maxlen=MAP_SCANS)
         self._whole: deque[tuple[Transform, SeenScan]] = deque(maxlen=NUM_WHOLE)
+        self._voxels = Voxels(config.voxel_m)
         self._light: refinement.LightSurface | None = None
         self._surface: refinement.Surface | None = None
         self._roughness_m = 0.0
@@ -115,7 +119,10 @@ class LocalMap:
             moved_m = geometry.displacement_m(scan.moments, T_odom_lidar, self.T_odom_map)
             if moved_m < SPACING_VOXELS * self.voxel_m:
                 return
+        if len(self._scans) == MAP_SCANS:
+            self._voxels.take_away(_moved(*self._scans[0]))
         self._scans.append((T_odom_lidar, scan.thinned))
+        self._voxels.add(_moved(*self._scans[-1]))
         self._whole.append((T_odom_lidar, scan))
         self._light = self._surface = None
 
@@ -123,29 +130,18 @@ class LocalMap:
         """All points of the newest scans, in the frame of the newest one: as many scans as give `enough` voxels."""
         gathered, num_thinned = [], 0
         for T_odom_lidar, scan in reversed(self._whole):
-            gathered.append(self._in_map(scan.points, T_odom_lidar))
+            is_newest = T_odom_lidar is self.T_odom_map  # coordinates on borders of voxels stay there
+            gathered.append(scan.points if is_newest else _moved(self.pose_of(T_odom_lidar), scan.points))
             num_thinned += len(scan.thinned)
             if num_thinned >= enough:
                 break
         return np.vstack(gathered).astype(np.float32)
 
-    def _in_map(self, points: Points, T_odom_lidar: Transform) -> Points:
-        """Points of a scan in the map's frame.
-
-        Those of the newest scan stay exactly the same: recorded coordinates are often multiples of a millimetre, and
-        would be rounded from the border of a voxel to either side.
-        """
-        if T_odom_lidar is self.T_odom_map:
-            return points
-        return geometry.apply(self.pose_of(T_odom_lidar), points.astype(np.float64))
-
     def light(self) -> refinement.LightSurface:
         """The surface of all scans as far from the newest one as a scan reaches, in its frame; cached."""
         if self._light is None:
-            clouds = [self._in_map(thinned, T_odom_lidar) for T_odom_lidar, thinned in self._scans]
-            if len(clouds) > 1:
-                clouds = [voxel_means(np.vstack(clouds), self.voxel_m, within_m=refinement.MAX_RANGE_M)]
-            self._light = refinement.LightSurface(clouds[0].astype(np.float32))
+            cloud = geometry.apply(geometry.inverse(self.T_odom_map), self._voxels.means())
+            self._light = refinement.LightSurface(cloud[within_range(cloud, 0.0, refinement.MAX_RANGE_M)])
             self._roughness_m = self._light.roughness_m(self.voxel_m, NUM_POINTS)
         return self._light
 
@@ -187,3 +183,45 @@ class LocalMap:
         found = nudge(source, target, T_map_guess, voxel_m=self.voxel_m, reaches=reaches, num_points=num_points)
         fit = None if found is None else self.fit(scan, found)
         return None if fit is None or fit.overlap == 0.0 else fit
+
+
+class Voxels:
+    """The mean point of each voxel of a fixed grid, of clouds that are added and taken away again."""
+
+    def __init__(self, voxel_m: float) -> None:
+        self._voxel_m = voxel_m
+        self._keys = np.empty(0, np.int64)
+        self._sums = np.empty((0, 4))
+        """Of the points of each voxel, in order of the keys: coordinates and number."""
+
+    def means(self) -> Points:
+        """(m, 3) the mean points."""
+        return self._sums[:, :3] / self._sums[:, 3:]
+
+    def add(self, points: Points) -> None:
+        """Add a cloud (n, 3)."""
+        keys, sums = self._summed(points)
+        rows = np.searchsorted(self._keys, keys)
+        is_known = np.isin(keys, self._keys, assume_unique=True)
+        self._sums[rows[is_known]] += sums[is_known]
+        self._keys = np.insert(self._keys, rows[~is_known], keys[~is_known])
+        self._sums = np.insert(self._sums, rows[~is_known], sums[~is_known], axis=0)
+
+    def take_away(self, points: Points) -> None:
+        """Take away a cloud that was added."""
+        keys, sums = self._summed(points)
+        self._sums[np.searchsorted(self._keys, keys)] -= sums
+        left = self._sums[:, 3] > 0.0
+        self._keys, self._sums = self._keys[left], self._sums[left]
+
+    def _summed(self, points: Points) -> tuple[Indices, np.ndarray]:
+        """Keys (k,) of the voxels of a cloud, ascending, and their sums (k, 4)."""
+        # recorded coordinates are often multiples of a millimetre: a third of a voxel on, none is on a border
+        cells = np.floor(points / self._voxel_m + 1.0 / 3.0).astype(np.int64) + MOST_CELLS
+        keys, row = np.unique(cells @ np.array([(2 * MOST_CELLS) ** 2, 2 * MOST_CELLS, 1]), return_inverse=True)
+        columns = [*points.T, np.ones(len(points))]
+        return keys, np.column_stack([np.bincount(row, weights=column) for column in columns])
+
+
+def _moved(T: Transform, points: Points) -> Points:
+    return geometry.apply(T, points.astype(np.float64))

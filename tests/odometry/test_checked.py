@@ -22,7 +22,7 @@ from segslam.odometry import local_map
 from segslam.odometry.checked import CheckedOdometry
 from segslam.odometry.kiss import KissOdometry
 from segslam.odometry.likelihood import Fit, fit
-from segslam.odometry.local_map import LocalMap, SeenScan
+from segslam.odometry.local_map import LocalMap, SeenScan, Voxels
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, information_of
 from segslam.odometry.nudge import POLISH_VOXELS, nudge
 from segslam.odometry.scan_to_map import Proposed
@@ -329,7 +329,7 @@ def test_a_turn_that_no_search_reaches_is_recognised_where_the_found_pose_contra
     """Also if no other pose is nearly as likely."""
     monkeypatch.setattr(PoseSearch, "elsewhere", lambda search, fits: 0.0)
     scans, truth = round_drive()
-    turn = geometry.transform(geometry.yaw(np.radians(100.0)), np.zeros(3))
+    turn = geometry.transform(geometry.yaw(np.radians(90.0)), np.zeros(3))
     turned = replace(scans[SLIP_AT], points=geometry.apply(geometry.inverse(turn), scans[SLIP_AT].points))
     odometry = CheckedOdometry(_LikeKiss(truth, CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
     results = _registered(odometry, [*scans[:SLIP_AT], turned])
@@ -742,6 +742,20 @@ def test_the_local_map_ends_where_no_scan_reaches() -> None:
     far_m = np.linalg.norm(local.surface().points, axis=1)
     assert 55.0 < far_m.max() < 60.0
     assert local.surface().points[:, 0].min() < -58.0  # seen by the scan before
+
+
+def test_a_cloud_that_is_taken_away_leaves_the_means_of_the_others() -> None:
+    first, second = np.random.default_rng(2).uniform(-3.0, 3.0, (2, 500, 3)) + 1000.0
+    both, one = Voxels(0.5), Voxels(0.5)
+    both.add(first)
+    both.add(second)
+    one.add(second)
+    assert len(both.means()) > len(one.means())
+    both.take_away(first)
+    np.testing.assert_allclose(both.means(), one.means(), atol=1e-9)
+    cells = np.floor(second / 0.5 + 1.0 / 3.0)
+    expected = [second[(cells == cell).all(axis=1)].mean(axis=0) for cell in np.unique(cells, axis=0)]
+    np.testing.assert_allclose(one.means(), expected, atol=1e-9)
 
 
 def test_a_given_motion_predicts_the_next_one() -> None:

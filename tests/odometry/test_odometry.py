@@ -24,7 +24,7 @@ ONE_THREAD = OdometryConfig(max_num_threads=1)  # the first odometry of a proces
 
 def _scan(points: np.ndarray, *, index: int = 0, stamp_ns: int = 0, times: np.ndarray | None = None) -> Scan:
     """Labels number the points, so that a row out of step shows."""
-    labels = (np.arange(len(points)) % 251).astype(np.uint8)
+    labels = (np.arange(len(points)) % 26).astype(np.uint8)
     return Scan(points, stamp_ns, index, labels, np.empty(0) if times is None else times)
 
 

@@ -1,8 +1,9 @@
 """The most likely pose of each scan in the local map, among those to which proposals lead, and how sure it is.
 
 Proposals are the odometry's motion and the last motion; and, if no pose near a proposal explains the scan as scans of
-this drive usually are explained or has a good score, no motion and poses all around, and by place recognition. Where
-several poses explain the scan nearly as well, the one with the usual motion is the most likely. Points with times are
+this drive usually are explained or has a good score, no motion and poses all around, and by place recognition. Once it
+is known what is usual, a few steps from the odometry's pose suffice where they explain the scan so. Where several poses
+explain the scan nearly as well, the one with the usual motion is the most likely. Points with times are
 moved to the end of their sweep by the motion that the pose shows, and the scan is registered again.
 """
 

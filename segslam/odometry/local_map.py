@@ -164,13 +164,9 @@ class LocalMap:
         polished = self._nudged(scan, found.T_target_source, POLISH_VOXELS, NUM_POINTS)
         return [] if polished is None else [polished]
 
-    def polish(self, scan: SeenScan, T_map_guess: Transform) -> Fit | None:
-        """The pose of a scan in the map near a good guess, by robust steps alone; None as `approach`."""
-        return self._nudged(scan, T_map_guess, SEARCH_VOXELS, NUM_POINTS)
-
-    def approach(self, scan: SeenScan, T_map_guess: Transform) -> Fit | None:
-        """The pose to which robust steps with few points lead from a guess; None if too few points are near the map."""
-        return self._nudged(scan, T_map_guess, SEARCH_VOXELS, NUM_SEARCH)
+    def approach(self, scan: SeenScan, T_map_guess: Transform, *, num_points: int = NUM_SEARCH) -> Fit | None:
+        """The pose to which robust steps lead from a guess, with few points; None if too few are near the map."""
+        return self._nudged(scan, T_map_guess, SEARCH_VOXELS, num_points)
 
     def fit(self, scan: SeenScan, T_map_lidar: Transform) -> Fit:
         """The likelihood of the scan at this pose."""

@@ -16,7 +16,7 @@ NUM_POINTS, NUM_SEARCH = 1500, 400
 """Chosen: number of points. With all points the correction of KITTI's scans at 2 m changes by less than 5 mm; fewer are
 enough to find where a search from afar ends."""
 POLISH_VOXELS = (1.4, 1.4, 1.0, 1.0, 1.0)
-"""Chosen: the same after GICP, to which every point has the same weight."""
+"""Chosen: search distance of each step after GICP, in voxels of the points; to GICP every point has the same weight."""
 SEARCH_VOXELS = (4.0, 3.0, 2.0, 2.0, 1.4, 1.4, 1.0, 1.0, 1.0, 1.0)
 """Chosen: the same from an initial guess."""
 SCALE_VOXELS = 0.2

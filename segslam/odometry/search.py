@@ -15,7 +15,7 @@ from segslam.core.types import Alignment, Information, Points, Rejected, Transfo
 from segslam.keyframes import DENSE_VOXELS
 from segslam.odometry.likelihood import Fit
 from segslam.odometry.local_map import SEARCH_VOXELS_GICP, LocalMap, SeenScan
-from segslam.odometry.nudge import SEARCH_VOXELS
+from segslam.odometry.nudge import NUM_POINTS, SEARCH_VOXELS
 from segslam.verification import patches, score
 
 Recover = Callable[[Points, Points], Alignment | Rejected]
@@ -54,9 +54,9 @@ class PoseSearch:
                 starts.append(T_map_start)
         return self._compared([*known, *self._registered(starts)])
 
-    def polished(self, T_map_proposed: Transform) -> list[Fit]:
+    def beside(self, T_map_proposed: Transform) -> list[Fit]:
         """The pose at which a few steps from the proposed one end; none if that is another pose."""
-        found = self.local.polish(self._scan, T_map_proposed)
+        found = self.local.approach(self._scan, T_map_proposed, num_points=NUM_POINTS)
         is_near = found is not None and self.is_same(found.T_map_lidar, T_map_proposed)
         return [self._with_prior(found)] if found is not None and is_near else []
 

@@ -527,7 +527,6 @@ def test_a_pose_at_which_no_point_is_near_the_map_is_none(monkeypatch: pytest.Mo
     monkeypatch.setattr(local_map, "nudge", lambda *_, **__: far)
     assert local.register(scan, np.eye(4)) == []
     assert local.approach(scan, np.eye(4)) is None
-    assert local.polish(scan, np.eye(4)) is None
 
 
 def test_points_on_the_borders_of_voxels_are_in_the_same_ones_for_poses_that_differ_by_rounding() -> None:

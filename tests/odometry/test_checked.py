@@ -14,7 +14,17 @@ from scipy.linalg import eigh
 from segslam.core import geometry
 from segslam.core.config import Config, load_config
 from segslam.core.evaluation import trajectory_metrics
-from segslam.core.types import Motion, MotionState, Registration, Rejected, RejectReason, Scan, Step, Trajectory
+from segslam.core.types import (
+    Motion,
+    MotionState,
+    Registration,
+    Rejected,
+    RejectReason,
+    Scan,
+    Step,
+    Trajectory,
+    Transform,
+)
 from segslam.graph.graph import BREAK_LENGTH_M
 from segslam.graph.noise import odometry_information
 from segslam.labels.label_files import unlabelled
@@ -806,6 +816,21 @@ def test_a_few_steps_correct_a_small_slip(moved_m: float) -> None:
     found = nudge(seen[1].thinned, target, T_slipped, voxel_m=CONFIG.refine.voxel_m, reaches=POLISH_VOXELS)
     assert found is not None
     assert geometry.distance(geometry.inverse(T_slipped) @ found) == pytest.approx(moved_m, abs=0.06)
+
+
+@pytest.mark.long
+def test_a_few_steps_from_a_pose_that_is_unlike_the_last_motion_do_not_suffice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the slipped pose there is a local optimum, which explains the scan as usual."""
+
+    def beside(search: PoseSearch, T_map_proposed: Transform) -> list[Fit]:
+        return [replace(search.local.fit(search._scan, T_map_proposed), mean_log=10.0)]
+
+    monkeypatch.setattr(PoseSearch, "beside", beside)
+    scans, truth = round_drive()
+    trajectory = replace(truth, T_world_lidar=_slipped(metres=2.0, at=WINDOW + 3))
+    odometry = CheckedOdometry(_LikeKiss(trajectory, CONFIG.odometry), CONFIG, recover=partial(register, config=CONFIG))
+    results = _registered(odometry, scans[: WINDOW + 5])
+    assert _worst_step_m(results) < 0.25
 
 
 @pytest.mark.long

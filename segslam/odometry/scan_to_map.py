@@ -2,9 +2,9 @@
 
 Proposals are the odometry's motion and the last motion; and, if no pose near a proposal explains the scan as scans of
 this drive usually are explained or has a good score, no motion and poses all around, and by place recognition. Once it
-is known what is usual, a few steps from the odometry's pose suffice where they explain the scan so, and the last motion
-leads to the same pose. Where several poses explain the scan nearly as well, the one with the usual motion is the most
-likely. Points with times are moved to the end of their sweep by the motion that the pose shows, and the scan is
+is known what is usual, a few steps from the odometry's pose suffice where they explain the scan so, and those from the
+last motion end there, too. Where several poses explain the scan nearly as well, the one with the usual motion is the
+most likely. Points with times are moved to the end of their sweep by the motion that the pose shows, and the scan is
 registered again.
 """
 
@@ -161,8 +161,7 @@ class ScanToMap:
         """Poses in the local map, which may be that before a break again, the most likely first; and their search."""
         search = self._search(proposed)
         starts = [self.local.pose_of(T) for T in (proposed.T_odom_lidar, proposed.T_odom_predicted)]
-        is_expected = len(self._last_fits) == WINDOW and proposed.gap == 1.0 and search.is_same(*starts)
-        fits = search.beside(starts[0]) if is_expected else []
+        fits = search.beside(starts) if len(self._last_fits) == WINDOW and proposed.gap == 1.0 else []
         if not self._is_usual(fits):
             fits = search.near(starts)
         rejoined = self._rejoined(proposed, fits)

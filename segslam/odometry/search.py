@@ -54,11 +54,13 @@ class PoseSearch:
                 starts.append(T_map_start)
         return self._compared([*known, *self._registered(starts)])
 
-    def beside(self, T_map_proposed: Transform) -> list[Fit]:
-        """The pose at which a few steps from the proposed one end; none if that is another pose."""
-        found = self.local.approach(self._scan, T_map_proposed, num_points=NUM_POINTS)
-        is_near = found is not None and self.is_same(found.T_map_lidar, T_map_proposed)
-        return [self._with_prior(found)] if found is not None and is_near else []
+    def beside(self, T_map_proposed: Sequence[Transform]) -> list[Fit]:
+        """The pose beside the first proposal at which a few steps from each one end; none if one ends elsewhere."""
+        first = T_map_proposed[0]
+        starts = [first, *(T for T in T_map_proposed[1:] if not self.is_same(T, first))]
+        found = [self.local.approach(self._scan, T_map_start, num_points=NUM_POINTS) for T_map_start in starts]
+        fits = [fit for fit in found if fit is not None and self.is_same(fit.T_map_lidar, first)]
+        return [self._with_prior(fits[0])] if len(fits) == len(starts) else []
 
     def around(self, T_map_last: Transform, T_step: Transform, known: Sequence[Fit]) -> list[Fit]:
         """`known` poses and those reached from poses around the last one: turned, and moved by shares of `T_step`."""

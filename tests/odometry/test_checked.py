@@ -14,17 +14,7 @@ from scipy.linalg import eigh
 from segslam.core import geometry
 from segslam.core.config import Config, load_config
 from segslam.core.evaluation import trajectory_metrics
-from segslam.core.types import (
-    Motion,
-    MotionState,
-    Registration,
-    Rejected,
-    RejectReason,
-    Scan,
-    Step,
-    Trajectory,
-    Transform,
-)
+from segslam.core.types import Motion, MotionState, Registration, Rejected, RejectReason, Scan, Step, Trajectory
 from segslam.graph.graph import BREAK_LENGTH_M
 from segslam.graph.noise import odometry_information
 from segslam.labels.label_files import unlabelled
@@ -822,7 +812,7 @@ def test_a_few_steps_correct_a_small_slip(moved_m: float) -> None:
 def test_a_few_steps_suffice_only_if_those_from_the_last_motion_end_there_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wherever they begin there is a local optimum, which explains the scan as usual; so at the slipped pose, too."""
 
-    def approach(local: LocalMap, scan: SeenScan, T_map_guess: Transform, *, num_points: int = 0) -> Fit:
+    def approach(local: LocalMap, scan: SeenScan, T_map_guess: np.ndarray, *, num_points: int = 0) -> Fit:
         return replace(local.fit(scan, T_map_guess), mean_log=10.0)
 
     monkeypatch.setattr(LocalMap, "approach", approach)

@@ -10,7 +10,7 @@ from segslam.core import geometry
 from segslam.core.config import RefineConfig
 from segslam.core.points import voxel_first, within_range
 from segslam.core.types import Indices, Points, Registration, Transform
-from segslam.odometry.likelihood import Fit, fit
+from segslam.odometry.likelihood import Correlation, Fit, fit
 from segslam.odometry.nudge import NUM_POINTS, NUM_SEARCH, POLISH_VOXELS, SEARCH_VOXELS, nudge
 from segslam.registration import refinement
 from segslam.registration.free_space import FreeSpace
@@ -80,7 +80,8 @@ class SeenScan:
 class LocalMap:
     """The last scans that moved, in the frame of the newest one."""
 
-    def __init__(self, config: RefineConfig) -> None:
+    def __init__(self, config: RefineConfig, correlation: Correlation) -> None:
+        self.correlation = correlation
         self.voxel_m = config.voxel_m
         reaches_m = tuple(reach * config.voxel_m for reach in SEARCH_VOXELS_GICP)
         self._config = config.model_copy(update={"correspondence_m": reaches_m})
@@ -171,7 +172,8 @@ class LocalMap:
     def fit(self, scan: SeenScan, T_map_lidar: Transform) -> Fit:
         """The likelihood of the scan at this pose."""
         surface = self.light()
-        return fit(scan.thinned, surface, T_map_lidar, voxel_m=self.voxel_m, sigma_m=self._roughness_m)
+        sigma_m = self._roughness_m
+        return fit(scan.thinned, surface, T_map_lidar, self.correlation, voxel_m=self.voxel_m, sigma_m=sigma_m)
 
     def _nudged(self, scan: SeenScan, T_map_guess: Transform, reaches: Sequence[float], num_points: int) -> Fit | None:
         """None also if a step leads away from the map: along a single plane, which does not constrain it."""

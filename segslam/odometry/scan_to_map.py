@@ -22,7 +22,7 @@ from segslam.core.config import Config
 from segslam.core.probabilities import INLIER_PROBABILITY, SIGNIFICANT
 from segslam.core.types import Information, Motion, Scan, Transform
 from segslam.graph.edges import BREAK_M
-from segslam.odometry.likelihood import LEAST_SIGMA_VOXELS, Fit
+from segslam.odometry.likelihood import LEAST_SIGMA_VOXELS, Correlation, Fit
 from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, MotionModel
 from segslam.odometry.search import PoseSearch, Recover
@@ -103,7 +103,8 @@ class ScanToMap:
         """`recover` registers two clouds without initial guess."""
         self._config = config
         self._recover = recover
-        self.local = LocalMap(config.refine)
+        self._correlation = Correlation(WINDOW)
+        self.local = LocalMap(config.refine, self._correlation)
         self._lost: tuple[LocalMap, Transform, float] | None = None
         """The map before a break, in which the next scans are tried, the motion per interval there, and the intervals
         since then."""
@@ -132,6 +133,8 @@ class ScanToMap:
                     fits, elsewhere, by_chance = recognised, 0.0, 0.0
         best = fits[0] if fits else self.local.fit(proposed.scan, self.local.pose_of(proposed.T_odom_lidar))
         self._last_fits.append(best.mean_log)
+        if fits:
+            self._correlation.note(best)
         unsure = search.spread(self._fused(fits, gap)) + elsewhere * np.diag(ANYWHERE**2)
         is_lost = elsewhere > 0.5 and not is_rejoined
         return Registered(proposed, search, fits, best, unsure, is_lost=is_lost, is_by_chance=by_chance >= 0.5)
@@ -147,7 +150,7 @@ class ScanToMap:
     def leave_map(self, T_step: Transform, gap: float) -> None:
         """Begin another map; the next scans are tried in this one, too. `T_step`: the motion per interval there."""
         self._lost = self._lost or (self.local, T_step, gap)
-        self.local = LocalMap(self._config.refine)
+        self.local = LocalMap(self._config.refine, self._correlation)
         self.motion.begin_map()
 
     def end_scan(self, scan: Scan, result: OdometryResult, gap: float) -> None:

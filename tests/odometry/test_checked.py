@@ -21,7 +21,7 @@ from segslam.labels.label_files import unlabelled
 from segslam.odometry import local_map
 from segslam.odometry.checked import CheckedOdometry
 from segslam.odometry.kiss import KissOdometry
-from segslam.odometry.likelihood import Fit, fit
+from segslam.odometry.likelihood import Correlation, Errors, Fit, fit
 from segslam.odometry.local_map import LocalMap, SeenScan, Voxels
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, information_of
 from segslam.odometry.nudge import POLISH_VOXELS, nudge
@@ -37,6 +37,7 @@ from segslam.verification import register
 
 CONFIG = load_config(None, ["proximity.min_travel_m=60"])
 SLIP_AT = 20
+NO_ERRORS = Errors(np.empty((0, 3)), np.empty((0, 6)))
 
 
 def _given(poses: np.ndarray, config: Config = CONFIG) -> GivenOdometry:
@@ -425,11 +426,34 @@ def test_of_two_poses_that_explain_a_scan_nearly_as_well_the_usual_motion_is_mor
     assert model.log_prior(step, exact, 1.0) == 0.0
     assert -8.0 < model.log_prior(turned, exact, 1.0) < -4.0, "large changes are rare, not impossible"
     fits = [
-        Fit(pose, mean_log, 100, 0.5, 0.1, np.eye(6), model.log_prior(pose, exact, 1.0))
+        Fit(pose, mean_log, 100, 0.5, 0.1, np.eye(6), NO_ERRORS, model.log_prior(pose, exact, 1.0))
         for pose, mean_log in ((turned, -2.44), (step, -2.47), (turned, -1.4))
     ]
     assert as_likely(fits[1], fits[0]) == 1.0, "the usual motion is more likely"
     assert as_likely(fits[1], fits[2]) < 0.01, "unless the scan shows the turn"
+
+
+@pytest.mark.parametrize("shared_m", [0.0, 0.05])
+def test_the_covariance_of_a_pose_is_that_of_its_errors_whether_or_not_points_share_theirs(shared_m: float) -> None:
+    """Each wall of a room errs by 2 cm a point, and by `shared_m` in each patch of 2 m."""
+    config, rng = CONFIG.refine, np.random.default_rng(0)
+    grid = np.mgrid[-10.0:10.0:41j, -10.0:10.0:41j].reshape(2, -1).T + 0.013
+    axes = [0, 1, 2, 0, 1, 2]
+    sides = [np.insert(grid, axis, at_m, axis=1) for axis, at_m in zip(axes, [-10, -10, -2, 10, 10, 6], strict=True)]
+    walls = np.vstack([side[(side[:, 2] >= -2.0) & (side[:, 2] <= 6.0)] for side in sides])
+    normals = np.repeat(np.eye(3)[axes], [len(side[(side[:, 2] >= -2.0) & (side[:, 2] <= 6.0)]) for side in sides], 0)
+    _, patch = np.unique(np.column_stack([walls // 2.0, normals]), axis=0, return_inverse=True)
+    surface, correlation, squares = LightSurface(walls), Correlation(WINDOW), []
+    for _ in range(60):
+        off_m = 0.02 * rng.standard_normal(len(walls)) + shared_m * rng.standard_normal(patch.max() + 1)[patch.ravel()]
+        points = (walls + off_m[:, None] * normals).astype(np.float32)
+        moved = nudge(points, surface, np.eye(4), voxel_m=config.voxel_m, reaches=POLISH_VOXELS)
+        assert moved is not None
+        found = fit(points, surface, moved, correlation, voxel_m=config.voxel_m, sigma_m=0.05)
+        correlation.note(found)
+        error = geometry.log(moved)
+        squares.append(float(error @ found.information @ error))
+    assert 0.6 < np.mean(squares) / 6.0 < 1.6
 
 
 def test_the_covariance_of_a_motion_is_at_least_its_own_whatever_the_errors_before_were() -> None:
@@ -479,7 +503,7 @@ def test_a_pose_at_which_one_point_meets_the_map_has_an_information(voxel_m: flo
     config = CONFIG.refine.model_copy(update={"voxel_m": voxel_m})
     level = rng.uniform(-55.0, 55.0, (3000, 2))
     scan = SeenScan(np.column_stack([level, np.full(3000, -1.7)]).astype(np.float32), config)
-    local = LocalMap(config)
+    local = LocalMap(config, Correlation(WINDOW))
     local.add(np.eye(4), scan)
     points = scan.surface.points
     far = points[np.linalg.norm(points, axis=1) > 40.0]
@@ -505,7 +529,7 @@ def test_a_narrow_view_of_new_surroundings_does_not_slide_back_along_a_wall(
         is_ahead = np.abs(np.arctan2(points[:, 1], points[:, 0])) < np.radians(35.0)
         return SeenScan(points[is_ahead], CONFIG.refine)
 
-    local, scan = LocalMap(CONFIG.refine), seen(row)
+    local, scan = LocalMap(CONFIG.refine, Correlation(WINDOW)), seen(row)
     for index in range(row):
         local.add(poses[index], seen(index))
     T_map_last, T_map_lidar = (geometry.inverse(local.T_odom_map) @ poses[index] for index in (row - 1, row))
@@ -519,7 +543,7 @@ def test_a_narrow_view_of_new_surroundings_does_not_slide_back_along_a_wall(
 
 def test_a_pose_at_which_no_point_is_near_the_map_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """A map of one plane constrains no step along it: steps of hundreds of metres were seen in real scans."""
-    local = LocalMap(CONFIG.refine)
+    local = LocalMap(CONFIG.refine, Correlation(WINDOW))
     scan = SeenScan(round_drive()[0][0].points, CONFIG.refine)
     local.add(np.eye(4), scan)
     assert local.approach(scan, np.eye(4)) is not None
@@ -533,7 +557,7 @@ def test_points_on_the_borders_of_voxels_are_in_the_same_ones_for_poses_that_dif
     points = (np.random.default_rng(0).integers(-40, 40, (2000, 3)) * CONFIG.refine.voxel_m).astype(np.float32)
 
     def made(*, moved_m: float) -> np.ndarray:
-        local = LocalMap(CONFIG.refine)
+        local = LocalMap(CONFIG.refine, Correlation(WINDOW))
         for x_m in (0.0, 1.03):
             pose = geometry.exp(np.array([0.1, 0.2, 1.0, 2.0 + x_m + moved_m, 3.0, 0.1]))
             local.add(pose, SeenScan(points, CONFIG.refine))
@@ -544,7 +568,7 @@ def test_points_on_the_borders_of_voxels_are_in_the_same_ones_for_poses_that_dif
 
 def test_poses_that_no_score_brings_among_the_first_are_not_scored(monkeypatch: pytest.MonkeyPatch) -> None:
     scans, truth = round_drive()
-    local = LocalMap(CONFIG.refine)
+    local = LocalMap(CONFIG.refine, Correlation(WINDOW))
     local.add(truth.T_world_lidar[0], SeenScan(scans[0].points, CONFIG.refine))
     scan = SeenScan(scans[1].points, CONFIG.refine)
     search = PoseSearch(local, scan)
@@ -612,7 +636,7 @@ def test_a_scan_that_no_proposal_explains_is_tried_with_turns_about_each_axis(ax
             starts.append(T_map_guess)
 
     scan = SeenScan(np.zeros((1, 3), np.float32), CONFIG.refine)
-    assert PoseSearch(Nothing(CONFIG.refine), scan).around(np.eye(4), np.eye(4), []) == []
+    assert PoseSearch(Nothing(CONFIG.refine, Correlation(WINDOW)), scan).around(np.eye(4), np.eye(4), []) == []
     turned = geometry.exp(np.radians(-30.0) * np.eye(6)[axis])
     assert any(np.allclose(start, turned) for start in starts)
 
@@ -717,7 +741,7 @@ def test_a_motion_is_as_uncertain_in_each_direction_as_the_scan_or_the_model_whi
 def test_a_scan_that_shows_nothing_in_a_direction_is_as_unsure_there_as_one_that_nothing_explains() -> None:
     odometry = _checked(round_drive()[1].T_world_lidar)
     information = np.diag([0.0, 1e6, 1e6, 0.0, 1e6, 1e6])
-    covariance = odometry._scans.covariance(Fit(np.eye(4), 0.0, 100, 1.0, 0.05, information))
+    covariance = odometry._scans.covariance(Fit(np.eye(4), 0.0, 100, 1.0, 0.05, information, NO_ERRORS))
     sigma = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(sigma[[0, 3]], [np.radians(60.0), 30.0], rtol=1e-3)
     assert (sigma[[1, 2, 4, 5]] < 0.04).all()
@@ -737,7 +761,7 @@ def test_how_far_two_poses_move_a_scan_is_seen_by_some_of_its_points(num_points:
 def test_the_local_map_ends_where_no_scan_reaches() -> None:
     generator = np.random.default_rng(1)
     points = np.column_stack([generator.uniform(-55.0, 55.0, (4000, 2)), np.zeros(4000)]).astype(np.float32)
-    local = LocalMap(CONFIG.refine)
+    local = LocalMap(CONFIG.refine, Correlation(WINDOW))
     for x_m in (0.0, 40.0):
         local.add(geometry.transform(np.eye(3), [x_m, 0.0, 0.0]), SeenScan(points, CONFIG.refine))
     far_m = np.linalg.norm(local.surface().points, axis=1)
@@ -855,7 +879,7 @@ def _behind_a_van(scan: Scan) -> np.ndarray:
 
 def test_a_vehicle_that_drives_ahead_does_not_hold_a_registration_back() -> None:
     scans, truth = round_drive()
-    local = LocalMap(CONFIG.refine)
+    local = LocalMap(CONFIG.refine, Correlation(WINDOW))
     for row in range(10):
         local.add(truth.T_world_lidar[row], SeenScan(_behind_a_van(scans[row]), CONFIG.refine))
     scan = SeenScan(_behind_a_van(scans[10]), CONFIG.refine)
@@ -907,8 +931,8 @@ def _into_a_tunnel(num_scans: int = 40) -> list[Scan]:
 def test_points_on_a_plane_are_as_likely_as_nine_tenths_of_inliers_make_them() -> None:
     at_m = np.arange(0.25, 15.0, 0.5)
     wall = np.stack([*np.meshgrid(at_m, at_m), np.full((30, 30), 2.0)], axis=-1).reshape(-1, 3).astype(np.float32)
-    found = fit(wall, LightSurface(wall), np.eye(4), voxel_m=0.5, sigma_m=0.1)
-    away = fit(wall + np.float32(30.0), LightSurface(wall), np.eye(4), voxel_m=0.5, sigma_m=0.1)
+    found = fit(wall, LightSurface(wall), np.eye(4), Correlation(WINDOW), voxel_m=0.5, sigma_m=0.1)
+    away = fit(wall + np.float32(30.0), LightSurface(wall), np.eye(4), Correlation(WINDOW), voxel_m=0.5, sigma_m=0.1)
     outlier = 0.1 / 2.0
     assert found.mean_log == pytest.approx(np.log(0.9 / (np.sqrt(2.0 * np.pi) * 0.1) + outlier), abs=1e-6)
     assert away.mean_log == pytest.approx(np.log(outlier), abs=1e-6)
@@ -920,7 +944,9 @@ def test_a_scan_of_a_smooth_tunnel_does_not_constrain_the_position_along_it() ->
     sigmas_m = []
     for points in ((_tunnel_scan(0).points @ R.T).astype(np.float32), round_drive()[0][0].points):
         scan = SeenScan(points, CONFIG.refine)
-        found = fit(scan.thinned, LightSurface(scan.thinned), np.eye(4), voxel_m=CONFIG.refine.voxel_m)
+        found = fit(
+            scan.thinned, LightSurface(scan.thinned), np.eye(4), Correlation(WINDOW), voxel_m=CONFIG.refine.voxel_m
+        )
         covariance = np.linalg.inv(found.information)[3:, 3:]
         sigmas_m.append(np.sqrt(np.linalg.eigvalsh(covariance)))
         if len(sigmas_m) == 1:
@@ -1055,7 +1081,7 @@ def test_a_map_before_a_break_is_used_again_if_it_explains_the_scan_better(is_be
     scans, truth = round_drive()
     odometry = _checked(truth.T_world_lidar)
     last = _registered(odometry, scans[:SLIP_AT])[-1].T_odom_lidar
-    before, odometry._scans.local = odometry._scans.local, LocalMap(CONFIG.refine)
+    before, odometry._scans.local = odometry._scans.local, LocalMap(CONFIG.refine, Correlation(WINDOW))
     odometry._scans._lost = before, odometry._motion.T_step, 1.0
     scan = SeenScan(scans[SLIP_AT].points, CONFIG.refine)
     T_odom_lidar = last @ geometry.inverse(truth.T_world_lidar[SLIP_AT - 1]) @ truth.T_world_lidar[SLIP_AT]
@@ -1076,7 +1102,7 @@ def test_a_map_before_a_break_is_found_again_where_the_motion_before_it_leads(nu
     scans, truth = round_drive()
     odometry = _checked(truth.T_world_lidar)
     last = _registered(odometry, scans[:SLIP_AT])[-1].T_odom_lidar
-    before, odometry._scans.local = odometry._scans.local, LocalMap(CONFIG.refine)
+    before, odometry._scans.local = odometry._scans.local, LocalMap(CONFIG.refine, Correlation(WINDOW))
     T_step, T_last_true = (
         geometry.inverse(truth.T_world_lidar[SLIP_AT - 1]) @ truth.T_world_lidar[SLIP_AT - 1 + num]
         for num in (num_steps, 8)

@@ -16,7 +16,6 @@ from segslam.core.types import Information, Motion, MotionState, Scan, Transform
 from segslam.graph.edges import BREAK_M
 from segslam.graph.noise import odometry_information
 from segslam.odometry.likelihood import Fit
-from segslam.odometry.local_map import SeenScan
 from segslam.odometry.motion_model import Intervals
 from segslam.odometry.scan_to_map import ANYWHERE, Proposed, ScanToMap
 from segslam.odometry.search import Recover
@@ -54,7 +53,7 @@ class CheckedOdometry:
         if not self._config.health.check:
             return at_stamp(scan, result)
         T_odom_predicted = self._scans.T_odom_last @ self._motion.predicted(gap)
-        seen = SeenScan(result.points, self._config.refine)
+        seen = self._scans.seen(result.points)
         proposed = Proposed(scan, result, seen, self._T_odom_inner @ result.T_odom_lidar, T_odom_predicted, gap)
         checked = self._checked(proposed)
         assert checked.motion

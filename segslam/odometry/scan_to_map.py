@@ -18,13 +18,14 @@ from typing import NamedTuple
 import numpy as np
 
 from segslam.core import geometry
-from segslam.core.config import Config
+from segslam.core.config import Config, RefineConfig
 from segslam.core.probabilities import INLIER_PROBABILITY, SIGNIFICANT
-from segslam.core.types import Information, Motion, Scan, Transform
+from segslam.core.types import Information, Motion, Points, Scan, Transform
 from segslam.graph.edges import BREAK_M
 from segslam.odometry.likelihood import LEAST_SIGMA_VOXELS, Correlation, Fit
 from segslam.odometry.local_map import LocalMap, SeenScan
 from segslam.odometry.motion_model import WINDOW, MotionModel
+from segslam.odometry.nudge import NUM_POINTS
 from segslam.odometry.search import PoseSearch, Recover
 from segslam.odometry.sweep import OdometryResult, swept_by
 from segslam.odometry.sweep_motion import SweepMotion, at_middle
@@ -104,6 +105,7 @@ class ScanToMap:
         self._config = config
         self._recover = recover
         self._correlation = Correlation(WINDOW)
+        self._refine: RefineConfig | None = None
         self.local = LocalMap(config.refine, self._correlation)
         self._lost: tuple[LocalMap, Transform, float] | None = None
         """The map before a break, in which the next scans are tried, the motion per interval there, and the intervals
@@ -114,6 +116,21 @@ class ScanToMap:
         self._last_fits: deque[float] = deque(maxlen=WINDOW)
         """How well the last scans that were registered were explained."""
         self._sweeps = SweepMotion()
+
+    def seen(self, points: Points) -> SeenScan:
+        """A scan, downsampled with the voxels that the first scan decides.
+
+        They are half as large if this has fewer points than are registered in the usual ones, and more than twice as
+        many then: half the edge means four times as many voxels on a surface that is seen densely, and as many on one
+        of which each point has its own.
+        """
+        if self._refine is None:
+            usual = self._config.refine
+            finer = usual.model_copy(update={"voxel_m": 0.5 * usual.voxel_m})
+            num_usual, num_finer = (len(SeenScan(points, config).thinned) for config in (usual, finer))
+            self._refine = finer if 2 * num_usual < min(num_finer, 2 * NUM_POINTS) else usual
+            self.local = LocalMap(self._refine, self._correlation)
+        return SeenScan(points, self._refine)
 
     def register(self, proposed: Proposed) -> Registered:
         """The most likely pose of a scan; the map before a break may become the local map again."""
@@ -150,7 +167,7 @@ class ScanToMap:
     def leave_map(self, T_step: Transform, gap: float) -> None:
         """Begin another map; the next scans are tried in this one, too. `T_step`: the motion per interval there."""
         self._lost = self._lost or (self.local, T_step, gap)
-        self.local = LocalMap(self._config.refine, self._correlation)
+        self.local = LocalMap(self._refine or self._config.refine, self._correlation)
         self.motion.begin_map()
 
     def end_scan(self, scan: Scan, result: OdometryResult, gap: float) -> None:
@@ -202,7 +219,7 @@ class ScanToMap:
             if T_sweep is None or geometry.displacement_m(proposed.scan.moments, T_before, T_sweep) < least_m:
                 break
             result = swept_by(proposed.raw, proposed.result, T_sweep, self._config.odometry)
-            moved = proposed._replace(result=result, scan=SeenScan(result.points, self._config.refine))
+            moved = proposed._replace(result=result, scan=self.seen(result.points))
             again = self._search(moved)
             found = again.near([fit.T_map_lidar for fit in fits])
             if not found:

@@ -25,10 +25,11 @@ from segslam.odometry.likelihood import Correlation, Errors, Fit, fit
 from segslam.odometry.local_map import LocalMap, SeenScan, Voxels
 from segslam.odometry.motion_model import WINDOW, Intervals, MotionModel, information_of
 from segslam.odometry.nudge import POLISH_VOXELS, nudge
-from segslam.odometry.scan_to_map import Proposed
+from segslam.odometry.scan_to_map import Proposed, ScanToMap
 from segslam.odometry.search import PoseSearch, as_likely
 from segslam.odometry.sweep import GivenOdometry, OdometryResult
 from segslam.odometry.tracker import Tracker
+from segslam.registration import refinement
 from segslam.registration.refinement import SHARED_NOISE_DEG, SHARED_NOISE_M, LightSurface
 from segslam.registration.refinement import refine as refined
 from segslam.scans import open_dataset
@@ -431,6 +432,23 @@ def test_of_two_poses_that_explain_a_scan_nearly_as_well_the_usual_motion_is_mor
     ]
     assert as_likely(fits[1], fits[0]) == 1.0, "the usual motion is more likely"
     assert as_likely(fits[1], fits[2]) < 0.01, "unless the scan shows the turn"
+
+
+@pytest.mark.parametrize(("side_m", "num_points", "share"), [(4.0, 20_000, 0.5), (4.0, 100, 1.0), (40.0, 20_000, 1.0)])
+def test_the_voxels_of_a_drive_are_half_as_large_if_its_first_scan_sees_little_and_that_densely(
+    side_m: float, num_points: int, share: float
+) -> None:
+    rng = np.random.default_rng(0)
+    floors = [rng.uniform(-0.5, 0.5, (num_points, 3)) * [side_m, side_m, 0.0] + [0.0, 0.0, z] for z in (-1.0, 1.5)]
+    scans = ScanToMap(CONFIG, recover=lambda *_: Rejected(RejectReason.SMALL_CLIQUE))
+    first = scans.seen(np.vstack(floors).astype(np.float32))
+    other = scans.seen((np.vstack(floors) * [44.0 / side_m, 44.0 / side_m, 1.0]).astype(np.float32))
+    assert scans.local.voxel_m == share * CONFIG.refine.voxel_m
+    for scan in (first, other):
+        downsampled = refinement.downsample(
+            scan.points, config=CONFIG.refine.model_copy(update={"voxel_m": scans.local.voxel_m})
+        )
+        assert np.array_equal(scan.thinned, downsampled)
 
 
 @pytest.mark.parametrize("shared_m", [0.0, 0.05])

@@ -22,8 +22,9 @@ NUM_WHOLE = 10
 """Number of the newest scans of which all points are kept, for registration without initial guess."""
 SPACING_VOXELS = 0.4
 """Chosen: a scan nearer than this to the last one in the map (`geometry.displacement_m`) adds nothing to it."""
-SEARCH_VOXELS_GICP = (4.0, 1.4)
-"""Chosen: search distances of GICP, in voxels."""
+SEARCH_REFINE, SEARCH_VOXELS_GICP = 2.0, 1.4
+"""Chosen: search distances of GICP: the first in those of `refine`, because how far a pose is off has nothing to do
+with voxels, the last in voxels."""
 
 MOST_CELLS = 1 << 20
 """Number of voxels from the start of the drive to where their keys are no longer distinct: 500 km."""
@@ -83,8 +84,11 @@ class LocalMap:
     def __init__(self, config: RefineConfig, correlation: Correlation) -> None:
         self.correlation = correlation
         self.voxel_m = config.voxel_m
-        reaches_m = tuple(reach * config.voxel_m for reach in SEARCH_VOXELS_GICP)
-        self._config = config.model_copy(update={"correspondence_m": reaches_m})
+        self.reach_m = SEARCH_REFINE * config.correspondence_m[0]
+        """Distance that a registration reaches."""
+        self.same_m = SEARCH_VOXELS_GICP * config.voxel_m
+        """Poses at this distance are the same: a registration from one reaches the other."""
+        self._config = config.model_copy(update={"correspondence_m": (self.reach_m, self.same_m)})
         self._scans: deque[tuple[Transform, Points]] = deque(maxlen=MAP_SCANS)
         self._whole: deque[tuple[Transform, SeenScan]] = deque(maxlen=NUM_WHOLE)
         self._voxels = Voxels(config.voxel_m)

@@ -242,7 +242,7 @@ class ScanToMap:
         After a gap the sensor may be anywhere: the prior is that of the motion, the evidence the score of loops. Where
         the best pose contradicts the last motions, these do not show either where else the sensor may be.
         """
-        untried = self.motion.may_exceed(search.far_m, gap)
+        untried = self.motion.may_exceed(search.local.reach_m, gap)
         if fits and fits[0].log_prior < math.log(1.0 - INLIER_PROBABILITY):
             untried = 1.0
         if not fits or untried < SIGNIFICANT:

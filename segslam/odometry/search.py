@@ -14,8 +14,8 @@ from segslam.core import geometry
 from segslam.core.types import Alignment, Information, Points, Rejected, Transform
 from segslam.keyframes import DENSE_VOXELS
 from segslam.odometry.likelihood import Fit
-from segslam.odometry.local_map import SEARCH_VOXELS_GICP, LocalMap, SeenScan
-from segslam.odometry.nudge import NUM_POINTS, SEARCH_VOXELS
+from segslam.odometry.local_map import LocalMap, SeenScan
+from segslam.odometry.nudge import NUM_POINTS
 from segslam.verification import patches, score
 
 Recover = Callable[[Points, Points], Alignment | Rejected]
@@ -38,13 +38,10 @@ class PoseSearch:
     def __init__(self, local: LocalMap, scan: SeenScan, *, prior: Prior = lambda fit: 0.0) -> None:
         """By default, any motion is as probable."""
         self.local, self._scan, self._prior = local, scan, prior
-        self._same_m = SEARCH_VOXELS_GICP[-1] * local.voxel_m
-        self.far_m = SEARCH_VOXELS[0] * local.voxel_m
-        """Distance that a registration reaches."""
 
     def is_same(self, T_map_a: Transform, T_map_b: Transform) -> bool:
         """True if a registration from one of two poses reaches the other."""
-        return geometry.displacement_m(self._scan.moments, T_map_a, T_map_b) < self._same_m
+        return geometry.displacement_m(self._scan.moments, T_map_a, T_map_b) < self.local.same_m
 
     def near(self, T_map_proposed: Sequence[Transform], known: Sequence[Fit] = ()) -> list[Fit]:
         """`known` poses and those to which registrations from the proposals lead, the most probable first."""
@@ -89,7 +86,7 @@ class PoseSearch:
         """Probability that a pose far from the most probable one is right instead; 1 without any pose."""
         if not fits:
             return 1.0
-        far = [fit for fit in fits[1:] if self._apart_m(fits[0], fit) > self.far_m]
+        far = [fit for fit in fits[1:] if self._apart_m(fits[0], fit) > self.local.reach_m]
         return max((as_likely(fit, fits[0]) for fit in far), default=0.0)
 
     def log_odds(self, fit: Fit) -> float:
@@ -107,7 +104,7 @@ class PoseSearch:
         """Covariance (6, 6) of the choice between poses near the most probable one, tangent in the scan's frame."""
         covariance, total = np.zeros((6, 6)), 1.0
         for fit in fits[1:]:
-            if self._apart_m(fits[0], fit) <= self.far_m:
+            if self._apart_m(fits[0], fit) <= self.local.reach_m:
                 offset = geometry.log(geometry.inverse(fits[0].T_map_lidar) @ fit.T_map_lidar)
                 weight = as_likely(fit, fits[0])
                 covariance += weight * np.outer(offset, offset)
